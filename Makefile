@@ -1,0 +1,47 @@
+# Everything a newcomer needs: make demo, make test. Requires Python 3.11+ and pip; all else goes into .venv.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.installed
+OUT ?= out/quick
+
+.PHONY: demo test lint validate install picture clean
+.DEFAULT_GOAL := help
+
+.PHONY: help
+help:
+	@echo "make demo      capture, reconstruct and relight scenes/quick.toml; the report lies in $(OUT)/report.html"
+	@echo "make test      the tests (minutes)"
+	@echo "make lint      style, types, import rules"
+	@echo "make validate  the slow tests as well"
+	@echo "make picture   the README's picture, from the demo's run"
+
+install: $(READY)
+
+$(READY): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "disco-twin needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) -V). Remedy: make PYTHON=python3.12 ..."; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@touch $@
+
+demo: $(READY)
+	$(BIN)/disco-twin run scenes/quick.toml --out $(OUT)
+	@echo "Report: $(abspath $(OUT))/report.html"
+
+test: $(READY)
+	$(BIN)/python -m pytest
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+validate: $(READY)
+	$(BIN)/python -m pytest -m "slow or not slow" --timeout 1800
+
+picture: $(READY)
+	$(BIN)/python -m disco_twin.report picture $(OUT) docs/picture.png
+
+clean:
+	rm -rf $(VENV) out build dist
