@@ -1,0 +1,1 @@
+"""The simulated DISCO rig: objects, light, cameras, ground truth, reports and the command line."""

@@ -1,0 +1,1 @@
+"""From images to a relightable model: capture, calibrate, reconstruct, relight."""
