@@ -1,0 +1,199 @@
+"""The calibration file: all that the pipeline knows of a rig, each figure with its uncertainty.
+
+Written from the nominal rig (`nominal_calibration`) or from measurements; readers cannot tell except by `source`.
+Everything is in the object frame (turntable frame at angle 0), mm and radians. A view is a pair of a camera and a
+turntable angle, cameras outermost: view = camera * n_angles + angle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError
+
+from hw.errors import InputError
+from hw.interface import Aim
+from hw.record import RadianceImage, RawImage, Sensor, to_radiance
+from pipeline.calibrate.camera import PinholeCamera, turn
+from pipeline.calibrate.projector import TwoMirrorProjector
+from pipeline.config import Strict
+from pipeline.rig import RigConfig
+
+F64 = NDArray[np.float64]
+Row = tuple[float, float, float, float]
+Pose = tuple[Row, Row, Row, Row]
+Error = Annotated[float, Field(ge=0)] | None  # one standard deviation; None: not measured
+
+
+class ViewCalibration(Strict):
+    """One camera at one turntable angle. Lengths in pixels where named so; distortion is k1 k2 p1 p2 k3."""
+
+    camera: str
+    angle_rad: float
+    width: int
+    height: int
+    focal_px: tuple[float, float]
+    centre_px: tuple[float, float]
+    distortion: tuple[float, float, float, float, float]
+    object_to_camera: Pose
+    focal_error_px: Error = None
+    rotation_error_rad: Error = None
+    translation_error_mm: Error = None
+
+
+class ProjectorCalibration(Strict):
+    """The projector at one turntable angle; its pose is relative to the object, which turns."""
+
+    angle_rad: float
+    steps: int
+    full_angle_rad: tuple[float, float]
+    separation_mm: float
+    beam_diameter_mm: float
+    object_to_projector: Pose
+    rotation_error_rad: Error = None
+    translation_error_mm: Error = None
+
+
+class LaserCalibration(Strict):
+    """Mean power at the object; the power during one image is the photodiode's reading in the stream."""
+
+    wavelength_nm: float
+    power_w: Annotated[float, Field(gt=0)]
+    power_error_w: Error = None
+
+
+class Calibration(Strict):
+    """See the module. `vignetting_exponent` n: a pixel seen at angle t off the optical axis receives cos(t)^n."""
+
+    format_version: Literal[1] = 1
+    source: Literal["nominal", "measured"]
+    views: Annotated[tuple[ViewCalibration, ...], Field(min_length=1)]
+    projectors: Annotated[tuple[ProjectorCalibration, ...], Field(min_length=1)]  # one per turntable angle
+    lasers: Annotated[tuple[LaserCalibration, ...], Field(min_length=1)]
+    sensor: Sensor
+    vignetting_exponent: float = 4.0
+
+    @property
+    def n_angles(self) -> int:
+        """Number of turntable angles."""
+        return len(self.projectors)
+
+    @property
+    def n_cameras(self) -> int:
+        """Number of cameras."""
+        return len(self.views) // self.n_angles
+
+    def views_at(self, angle: int) -> list[int]:
+        """The views (one per camera) that see the object at turntable angle number `angle`."""
+        return [camera * self.n_angles + angle for camera in range(self.n_cameras)]
+
+    def view_camera(self, view: int) -> PinholeCamera:
+        """The camera of a view in the object frame."""
+        v = self.views[view]
+        focal, centre = np.array(v.focal_px), np.array(v.centre_px)
+        return PinholeCamera(
+            v.width, v.height, focal, centre, np.array(v.distortion), np.array(v.object_to_camera, np.float64)
+        )
+
+    def projector(self, angle: int) -> TwoMirrorProjector:
+        """The projector in the object frame at turntable angle number `angle`."""
+        p = self.projectors[angle]
+        return TwoMirrorProjector(
+            p.steps, np.array(p.full_angle_rad), p.separation_mm, np.array(p.object_to_projector, np.float64)
+        )
+
+    def spot_rays(self, aims: Sequence[Aim]) -> tuple[F64, F64]:
+        """(S, 3) origins in mm and (S, 3) unit directions of the spots' beam axes in the object frame."""
+        origins, directions = np.empty((len(aims), 3)), np.empty((len(aims), 3))
+        of_angle = np.array([aim.angle for aim in aims], int)
+        steps = np.array([(aim.u, aim.v) for aim in aims], np.float64).reshape(-1, 2)
+        for angle in np.unique(of_angle):
+            here = of_angle == angle
+            origins[here], directions[here] = self.projector(int(angle)).rays(steps[here])
+        return origins, directions
+
+    def vignetting(self, view: int) -> F64:
+        """(H, W) relative illumination of the pixels by the lens, 1 on the optical axis."""
+        camera = self.view_camera(view)
+        xy = camera.undistort((camera.pixel_centres() - camera.centre) / camera.focal)
+        cosine = 1.0 / np.sqrt(1.0 + (xy**2).sum(axis=1))
+        return np.asarray(cosine.reshape(camera.height, camera.width) ** self.vignetting_exponent)
+
+    def radiance(self, raw: RawImage, view: int, laser: int) -> RadianceImage:
+        """(H, W) radiance in W/(mm^2 sr) with its variance, corrected for the lens's vignetting."""
+        image, gain = to_radiance(raw, self.sensor, laser), 1.0 / self.vignetting(view)
+        return replace(
+            image,
+            radiance=(image.radiance * gain).astype(np.float32),
+            variance=(image.variance * gain**2).astype(np.float32),
+        )
+
+    def save(self, path: Path) -> None:
+        """Write as JSON; numbers keep all their digits."""
+        path.write_text(self.model_dump_json(indent=1) + "\n", encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read what `save` wrote; anything else is refused in one line."""
+        try:
+            return cls.model_validate_json(path.read_bytes())
+        except OSError as error:
+            raise InputError(f"cannot be read ({error.strerror})", file=path) from error
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(str(part) for part in first["loc"]) or None
+            raise InputError(
+                f"not a calibration of format version 1: {first['msg']}",
+                file=path,
+                key=key,
+                remedy="calibrate again with this version",
+            ) from error
+
+
+def _pose(matrix: F64) -> Pose:
+    rows: list[Row] = [(float(a), float(b), float(c), float(d)) for a, b, c, d in matrix]
+    return rows[0], rows[1], rows[2], rows[3]
+
+
+def _pair(values: F64) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
+def nominal_calibration(rig: RigConfig, sensor: Sensor) -> Calibration:
+    """The calibration that would hold if the rig stood exactly as its configuration says."""
+    angles = [float(np.deg2rad(a)) for a in rig.turntable_angles_deg]
+    views = []
+    for config in rig.cameras:
+        camera = PinholeCamera.from_config(config)
+        for angle in angles:
+            views.append(
+                ViewCalibration(
+                    camera=config.name,
+                    angle_rad=angle,
+                    width=config.width,
+                    height=config.height,
+                    focal_px=_pair(camera.focal),
+                    centre_px=_pair(camera.centre),
+                    distortion=config.distortion,
+                    object_to_camera=_pose(camera.seen_from(turn(angle)).pose),
+                )
+            )
+    projector = TwoMirrorProjector.from_config(rig.projector)
+    projectors = tuple(
+        ProjectorCalibration(
+            angle_rad=angle,
+            steps=projector.steps,
+            full_angle_rad=_pair(projector.full_angle_rad),
+            separation_mm=projector.separation_mm,
+            beam_diameter_mm=rig.projector.beam_diameter_mm,
+            object_to_projector=_pose(projector.seen_from(turn(angle)).pose),
+        )
+        for angle in angles
+    )
+    lasers = tuple(LaserCalibration(wavelength_nm=x.wavelength_nm, power_w=x.power_mw * 1e-3) for x in rig.lasers)
+    return Calibration(source="nominal", views=tuple(views), projectors=projectors, lasers=lasers, sensor=sensor)

@@ -1,0 +1,47 @@
+"""Unpolarised Fresnel transmittance of a smooth dielectric, from air into a medium of relative index eta >= 1.
+
+By reciprocity the same factor holds on the way out, as a function of the direction outside (thesis eq. 2.1).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+def transmittance(cosine: ArrayLike, eta: float) -> NDArray[np.float64]:
+    """F_t: flux transmitted, 0..1, for the cosine between the outward normal and the direction outside.
+
+    Same shape as `cosine`; 0 at and below the horizon (cosine <= 0), 1 everywhere above it for eta = 1.
+    """
+    if eta < 1:
+        raise ValueError(f"relative index {eta} < 1: the light comes from the thinner side")
+    outside = np.clip(np.asarray(cosine, np.float64), 0.0, 1.0)
+    inside = np.sqrt(1.0 - (1.0 - outside**2) / eta**2)
+    # T = 1 - R written without the subtraction, which would lose all digits near grazing incidence.
+    with np.errstate(invalid="ignore"):
+        s = 4 * eta * outside * inside / (outside + eta * inside) ** 2
+        p = 4 * eta * outside * inside / (inside + eta * outside) ** 2
+    return np.asarray(np.where(outside > 0, 0.5 * (s + p), 0.0))
+
+
+def mean_transmittance(eta: float) -> float:
+    """Tbar = 2 * integral_0^1 F_t(c) c dc, the mean over a Lambertian hemisphere; 0.939 for eta = 1.3.
+
+    Closed form: one minus the external diffuse reflectance of Egan & Hilgeman 1979 (Walsh 1926, eq. 1).
+    """
+    if eta < 1:
+        raise ValueError(f"relative index {eta} < 1: the light comes from the thinner side")
+    if eta - 1 < 1e-4:
+        return 1.0 - (eta - 1) / 3.0  # first order, right to 4e-8; the closed form cancels here
+    m, m2, m4 = eta, eta**2, eta**4
+    reflectance = (
+        0.5
+        + (m - 1) * (3 * m + 1) / (6 * (m + 1) ** 2)
+        + m2 * (m2 - 1) ** 2 / (m2 + 1) ** 3 * math.log((m - 1) / (m + 1))
+        - 2 * m**3 * (m2 + 2 * m - 1) / ((m2 + 1) * (m4 - 1))
+        + 8 * m4 * (m4 + 1) / ((m2 + 1) * (m4 - 1) ** 2) * math.log(m)
+    )
+    return 1.0 - reflectance

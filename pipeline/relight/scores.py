@@ -1,0 +1,150 @@
+"""How well a relit image or an R_d agrees with the truth, when the truth is itself a Monte Carlo estimate.
+
+Two independent halves A and B of a reference have errors that are uncorrelated with each other, so that products such
+as (I - A)(I - B) hold the model's error and not the reference's noise. Nothing is clipped: a model better than the
+noise can show scores a little below zero.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+F64 = NDArray[np.float64]
+BLOCK = 8  # pixels: noise is taken as uncorrelated between blocks of this size, and between nothing smaller
+
+
+@dataclass(frozen=True)
+class RelitScore:
+    """Of one relit image against one reference, pooled over object pixels and wavelengths.
+
+    nrmse2:       <(I - A)(I - B)> / <A B>, signed
+    nrmse2_se:    its standard error from the reference's noise (the pixels are given, not drawn)
+    nrmse:        sign(nrmse2) sqrt|nrmse2|, with nrmse_se
+    nrmse_floor:  what noise would have added in quadrature to the nrmse against the mean of A and B
+    psnr:         dB, exposed to the 99th percentile, gamma 2.2; None where noise hides the error
+    energy_ratio: <I> / <(A + B) / 2>
+    """
+
+    nrmse: float
+    nrmse_se: float
+    nrmse_floor: float
+    psnr: float | None
+    energy_ratio: float
+    nrmse2: float
+    nrmse2_se: float
+    pixels: int
+
+
+def signed_root(square: float) -> float:
+    """sign(x) sqrt|x|."""
+    return math.copysign(math.sqrt(abs(square)), square)
+
+
+def _block_sums(values: F64, mask: NDArray[np.bool_]) -> F64:
+    """(L, N) values on the mask's pixels -> sums over wavelengths and BLOCK x BLOCK pixels, 1-D."""
+    rows, columns = np.nonzero(mask)
+    block = (rows // BLOCK) * (mask.shape[1] // BLOCK + 1) + columns // BLOCK
+    return np.bincount(block, weights=values.sum(axis=0))
+
+
+def _tone(image: F64, exposure: float) -> F64:
+    """Displayed value 0..1 of linear radiance: exposed, clipped, gamma 2.2."""
+    return np.asarray(np.clip(image / exposure, 0.0, 1.0) ** (1 / 2.2))
+
+
+def score_relit(image: ArrayLike, half_a: ArrayLike, half_b: ArrayLike, mask: NDArray[np.bool_]) -> RelitScore:
+    """Scores of `image` against a reference in two independent halves.
+
+    image, half_a, half_b: (L, H, W) linear radiance in W/(mm^2 sr); mask: (H, W), the object's pixels.
+
+    The standard error uses the symmetry under exchange of A and B. With m the model minus the mean M of both and
+    r = nrmse2, the sum over a block of (m + r M)(A - B) has mean zero and, for equal Gaussian noise, exactly the
+    variance of the block's part of the numerator minus r times the denominator, correlations inside included.
+    """
+    i, a, b = (np.asarray(x, np.float64)[:, mask] for x in (image, half_a, half_b))
+    if i.size == 0:
+        raise ValueError("the mask holds no pixel")
+    mean, half = (a + b) / 2, (a - b) / 2
+    denominator = float((a * b).sum())
+    if denominator <= 0:
+        raise ValueError("the reference holds no light above its noise")
+    nrmse2 = float(((i - a) * (i - b)).sum()) / denominator
+    noise = _block_sums((i - mean + nrmse2 * mean) * 2 * half, mask)
+    nrmse2_se = float(np.sqrt((noise**2).sum())) / denominator
+    # d sqrt(x) = dx / (2 sqrt(x)); within one standard error of zero the root itself is the scale.
+    root_se = min(nrmse2_se / (2 * math.sqrt(abs(nrmse2))) if nrmse2 else math.inf, math.sqrt(nrmse2_se))
+    exposure = float(np.percentile(mean, 99.0))
+    psnr = None
+    if exposure > 0:
+        ti, ta, tb = (_tone(x, exposure) for x in (i, a, b))
+        square = float(((ti - ta) * (ti - tb)).mean())
+        psnr = -10 * math.log10(square) if square > 0 else None
+    return RelitScore(
+        nrmse=signed_root(nrmse2),
+        nrmse_se=root_se,
+        nrmse_floor=math.sqrt(float((half**2).sum()) / denominator),
+        psnr=psnr,
+        energy_ratio=float(i.sum() / mean.sum()),
+        nrmse2=nrmse2,
+        nrmse2_se=nrmse2_se,
+        pixels=int(np.count_nonzero(mask)),
+    )
+
+
+@dataclass(frozen=True)
+class DecadeScore:
+    """Of an R_d against the truth, over the entries whose truth lies in one decade below the peak.
+
+    decade:      0 for (peak/10, peak], -1 for the next, ...
+    log10_rmse:  root mean square of log10(estimate / truth) over the covered entries, the truth's own noise removed
+                 (signed root); None where no entry is covered
+    floor:       the root mean square that the truth's noise had added
+    coverage:    share of the decade's entries that the estimate covers
+    entries:     number of entries of the decade
+    """
+
+    decade: int
+    log10_rmse: float | None
+    floor: float
+    coverage: float
+    entries: int
+
+
+def score_reflectance(
+    estimate: ArrayLike, truth: ArrayLike, truth_se: ArrayLike, covered: ArrayLike, decades: int = 4
+) -> tuple[DecadeScore, ...]:
+    """log10_rmse per decade below the peak of each wavelength, wavelengths pooled.
+
+    estimate, truth, truth_se: (L, n, V) in mm^-2; covered: bool, broadcast to the same shape. A covered estimate that
+    is not positive counts as one decade off. Entries whose truth is known to worse than a half are left out.
+    """
+    e, t, se = (np.asarray(x, np.float64) for x in (estimate, truth, truth_se))
+    seen = np.broadcast_to(np.asarray(covered, bool), t.shape)
+    usable = (t > 0) & (se < 0.5 * t)
+    if not usable.any():
+        raise ValueError("no entry of the truth is known to better than a half")
+    peak = np.where(usable, t, 0.0).max(axis=tuple(range(1, t.ndim)), keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        below = np.where(usable, np.log10(peak / t), np.inf)
+        error2 = np.where(e > 0, np.log10(e / t), 1.0) ** 2
+        noise2 = (se / (t * math.log(10))) ** 2
+    scores = []
+    for decade in range(decades):
+        of_decade = usable & (below >= decade) & (below < decade + 1)
+        chosen = of_decade & seen
+        entries, count = int(np.count_nonzero(of_decade)), int(np.count_nonzero(chosen))
+        removed = float(noise2[chosen].mean()) if count else 0.0
+        scores.append(
+            DecadeScore(
+                decade=-decade,
+                log10_rmse=signed_root(float(error2[chosen].mean()) - removed) if count else None,
+                floor=math.sqrt(removed),
+                coverage=count / entries if entries else 0.0,
+                entries=entries,
+            )
+        )
+    return tuple(scores)
