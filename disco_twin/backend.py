@@ -74,7 +74,7 @@ def llvm_version(path: str) -> int | None:
 
 
 def candidates() -> Iterator[str]:
-    """Paths of libLLVM that may be there, best first: the environment's own (wheel), then the system's, newest first."""
+    """Paths of libLLVM that may be there, best first: the Python environment's own, then the system's, newest first."""
     if sys.platform == "darwin":
         yield from _existing(Path(sys.prefix) / "lib", ["libLLVM.dylib", "libLLVM-*.dylib"])
         for root in ("/opt/homebrew/opt", "/usr/local/opt"):
@@ -100,7 +100,7 @@ def _existing(folder: Path, patterns: Iterable[str]) -> list[str]:
 
 
 def choose_llvm(paths: Iterable[str], chosen_by_user: str | None) -> tuple[Library, str]:
-    """The library to use and the reason. A user's own choice is honoured, or refused with the reason; never replaced."""
+    """The library to use and the reason. A user's own choice is honoured or refused with the reason, never replaced."""
     if chosen_by_user:
         version = llvm_version(chosen_by_user)
         if version is None:
@@ -145,15 +145,14 @@ def activate() -> Backend:
     global _active
     if _active is not None:
         return _active
-    if has_cuda_driver():
+    if ENVIRONMENT_KEY not in os.environ and has_cuda_driver():
         backend = Backend("cuda_ad_mono", None, None, "a CUDA driver is present")
     else:
-        library, reason = choose_llvm(candidates(), os.environ.get(ENVIRONMENT_KEY))
-        _refuse_early_import(library)
+        library, reason = _library()
         os.environ[ENVIRONMENT_KEY] = library.path
         backend = Backend("llvm_ad_mono", library.path, library.version, reason)
     try:
-        import mitsuba as mi  # noqa: PLC0415 - only after the library is chosen
+        import mitsuba as mi  # only now: Dr.Jit loads LLVM when it is imported
     except ImportError as error:
         raise BackendError(
             f"the renderer is not installed ({error}). Remedy: pip install 'mitsuba>=3.9,<3.10'"
@@ -164,14 +163,17 @@ def activate() -> Backend:
     return backend
 
 
-def _refuse_early_import(library: Library) -> None:
-    """Dr.Jit loads LLVM with its first LLVM array and keeps it: what it holds then must be what we chose."""
-    if "drjit" not in sys.modules or os.environ.get(ENVIRONMENT_KEY) == library.path:
-        return
-    import drjit  # noqa: PLC0415 - it is imported already
+def _library() -> tuple[Library, str]:
+    """The library to use and why; where drjit is imported already, the one that it holds, if that one works."""
+    if "drjit" not in sys.modules:
+        return choose_llvm(candidates(), os.environ.get(ENVIRONMENT_KEY))
+    import drjit
 
-    if drjit.has_backend(drjit.JitBackend.LLVM):
+    version = drjit.detail.llvm_version()
+    if not version or int(version[0]) < OLDEST_LLVM:
+        held = f"LLVM {version[0]}" if version else "no LLVM"
         raise BackendError(
-            "drjit was imported before disco_twin.backend.activate() and may hold another LLVM library. "
-            f"Remedy: call activate() first, or set {ENVIRONMENT_KEY}={library.path}"
+            f"drjit was imported before disco_twin.backend.activate() and holds {held} "
+            f"(allowed: {OLDEST_LLVM} or newer). Remedy: call activate() before anything imports drjit or mitsuba"
         )
+    return Library(os.environ.get(ENVIRONMENT_KEY, "libLLVM"), int(version[0])), "drjit was imported before"

@@ -1,0 +1,185 @@
+"""The run folder: where things lie, whose scene it is, and which stages are finished (so that a run can resume).
+
+    OUT/scene.toml  run.log  stages.json  summary.json  report.html
+    OUT/capture/    all that the pipeline reads        OUT/work/   the pipeline's outputs
+    OUT/twin/       what the pipeline never sees: the simulated responses, true R_d, references
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from disco_twin.resources import measured
+from hw.errors import InputError
+
+FORMAT_VERSION = 1
+
+
+@dataclass
+class StageRecord:
+    """A stage's inputs as a key, and what it took. Seconds add up over interruptions; the peak is the largest."""
+
+    name: str
+    key: str
+    seconds: float = 0.0
+    peak_mb: float = 0.0
+    finished: bool = False
+
+
+@dataclass
+class RunFolder:
+    """One run's folder. `identity` says which scene's capture it holds."""
+
+    root: Path
+    identity: str = ""
+    stages: dict[str, StageRecord] = field(default_factory=dict)
+
+    @property
+    def scene_file(self) -> Path:
+        return self.root / "scene.toml"
+
+    @property
+    def capture(self) -> Path:
+        return self.root / "capture"
+
+    @property
+    def twin(self) -> Path:
+        return self.root / "twin"
+
+    @property
+    def work(self) -> Path:
+        return self.root / "work"
+
+    @property
+    def journal(self) -> Path:
+        return self.root / "stages.json"
+
+    @property
+    def summary_file(self) -> Path:
+        return self.root / "summary.json"
+
+    @property
+    def report_file(self) -> Path:
+        return self.root / "report.html"
+
+    @classmethod
+    def open(cls, root: Path) -> RunFolder:
+        """An existing run folder."""
+        folder = cls(root)
+        if not folder.journal.is_file():
+            raise InputError("is no run folder", file=root, remedy="give the --out folder of `disco-twin run`")
+        folder._load()
+        return folder
+
+    @classmethod
+    def claim(cls, root: Path, scene_file: Path, identity: str) -> RunFolder:
+        """The folder for this scene: made, or resumed; a folder that holds anything else is refused."""
+        folder = cls(root, identity)
+        if root.exists() and not root.is_dir():
+            raise InputError("is not a folder", file=root, remedy="choose another --out")
+        if folder.journal.is_file():
+            folder._load()
+            if folder.identity != identity:
+                raise InputError(
+                    "the folder holds the run of another scene or profile, or the scene has changed since",
+                    file=root,
+                    remedy="choose another --out, or delete this one",
+                )
+        elif root.is_dir() and any(root.iterdir()):
+            raise InputError("the folder is not empty and holds no run", file=root, remedy="choose another --out")
+        folder.identity = identity
+        for path in (folder.capture, folder.twin, folder.work):
+            path.mkdir(parents=True, exist_ok=True)
+        write_atomically(folder.scene_file, scene_file.read_bytes())
+        folder._save()
+        return folder
+
+    def run(self, name: str, key: str, work: Callable[[], float | None]) -> bool:
+        """Do a stage unless it is finished under the same key; True if it was done now.
+
+        `work` may return the peak memory in MiB of a process of its own, which then counts as the stage's.
+        """
+        record = self.stages.get(name)
+        if record is not None and record.key == key and record.finished:
+            return False
+        if record is None or record.key != key:
+            record = StageRecord(name, key)
+        self.stages[name] = record
+        child: float | None = None
+        usage = None
+        try:
+            with measured() as usage:
+                child = work()
+            record.finished = True
+        finally:
+            if usage is not None:
+                record.seconds += usage.seconds
+                record.peak_mb = max(record.peak_mb, usage.peak_mb if child is None else child)
+            self._save()
+        return True
+
+    def _load(self) -> None:
+        try:
+            data = json.loads(self.journal.read_text())
+            if data["format_version"] != FORMAT_VERSION:
+                raise InputError(
+                    f"format_version is {data['format_version']}",
+                    file=self.journal,
+                    allowed=str(FORMAT_VERSION),
+                    remedy="choose another --out",
+                )
+            self.identity = data["identity"]
+            self.stages = {s["name"]: StageRecord(**s) for s in data["stages"]}
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"is damaged ({error})", file=self.journal, remedy="choose another --out") from error
+
+    def _save(self) -> None:
+        data = {
+            "format_version": FORMAT_VERSION,
+            "identity": self.identity,
+            "stages": [asdict(s) for s in self.stages.values()],
+        }
+        write_atomically(self.journal, json.dumps(data, indent=1).encode())
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file as a whole: a reader, or a run after a crash, sees the old content or the new."""
+    temporary = path.with_name(path.name + ".part")
+    with temporary.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def content_key(*parts: Any) -> str:
+    """SHA-256 over the parts: text, bytes, files (their content), or anything that JSON can hold."""
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, Path):
+            data = part.read_bytes()
+        elif isinstance(part, bytes):
+            data = part
+        else:
+            data = (part if isinstance(part, str) else json.dumps(part, sort_keys=True)).encode()
+        digest.update(len(data).to_bytes(8, "little"))
+        digest.update(data)
+    return digest.hexdigest()
+
+
+def source_key(package: str) -> str:
+    """Key of a package's source code: a method developer's change makes its stage run again."""
+    from importlib.util import find_spec
+
+    spec = find_spec(package)
+    if spec is None or spec.origin is None:
+        raise InputError(f"the package {package} is not installed", remedy="make install")
+    origin = Path(spec.origin)
+    files = sorted(origin.parent.rglob("*.py")) if origin.name == "__init__.py" else [origin]
+    return content_key(*files)

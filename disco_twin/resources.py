@@ -1,0 +1,75 @@
+"""Seconds and peak memory of a stage, each measured for that stage alone."""
+
+from __future__ import annotations
+
+import os
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+MIB = 1024.0 * 1024.0
+
+
+@dataclass
+class Usage:
+    """Wall-clock seconds and peak resident memory in MiB; complete when the measured block has ended."""
+
+    seconds: float = 0.0
+    peak_mb: float = 0.0
+
+
+@contextmanager
+def measured() -> Iterator[Usage]:
+    """Measure a block. On Linux its peak is its own; elsewhere it is the process's so far (an upper bound)."""
+    usage = Usage()
+    _reset_peak()
+    start = time.perf_counter()
+    try:
+        yield usage
+    finally:
+        usage.seconds += time.perf_counter() - start
+        usage.peak_mb = max(usage.peak_mb, peak_memory_mb())
+
+
+def _reset_peak() -> None:
+    """Linux resets a process's high-water mark when 5 is written to clear_refs; sandboxes may forbid it."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return
+
+
+def peak_memory_mb() -> float:
+    """Peak resident memory of this process in MiB since the last reset."""
+    try:
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return float(line.split()[1]) / 1024.0
+    except OSError:
+        pass  # no /proc (macOS): ask getrusage
+    return _maxrss_mb(resource.getrusage(resource.RUSAGE_SELF))
+
+
+def wait_for(pid: int) -> tuple[int, float]:
+    """Wait for a child process: its exit status (negative: the signal that ended it) and its peak memory in MiB."""
+    _, status, usage = os.wait4(pid, 0)
+    return os.waitstatus_to_exitcode(status), _maxrss_mb(usage)
+
+
+def _maxrss_mb(usage: resource.struct_rusage) -> float:
+    """`ru_maxrss` is in bytes on macOS and in KiB elsewhere."""
+    return usage.ru_maxrss / (MIB if sys.platform == "darwin" else 1024.0)
+
+
+def total_memory_gb() -> float:
+    """Physical memory in GiB."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / MIB / 1024.0
+
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
