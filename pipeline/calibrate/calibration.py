@@ -7,6 +7,7 @@ turntable angle, cameras outermost: view = camera * n_angles + angle.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,14 +15,14 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from hw.errors import InputError
 from hw.interface import Aim
 from hw.record import RadianceImage, RawImage, Sensor, to_radiance
 from pipeline.calibrate.camera import PinholeCamera, turn
 from pipeline.calibrate.projector import TwoMirrorProjector
-from pipeline.config import Strict
+from pipeline.config import Strict, check
 from pipeline.rig import RigConfig
 
 F64 = NDArray[np.float64]
@@ -141,18 +142,14 @@ class Calibration(Strict):
     def load(cls, path: Path) -> Self:
         """Read what `save` wrote; anything else is refused in one line."""
         try:
-            return cls.model_validate_json(path.read_bytes())
+            data = json.loads(path.read_text(encoding="utf-8"))
         except OSError as error:
-            raise InputError(f"cannot be read ({error.strerror})", file=path) from error
-        except ValidationError as error:
-            first = error.errors()[0]
-            key = ".".join(str(part) for part in first["loc"]) or None
-            raise InputError(
-                f"not a calibration of format version 1: {first['msg']}",
-                file=path,
-                key=key,
-                remedy="calibrate again with this version",
-            ) from error
+            raise InputError(f"cannot be read ({error.strerror})", file=path, remedy="calibrate first") from error
+        except ValueError as error:
+            raise InputError("is not JSON", file=path, remedy="calibrate again") from error
+        if not isinstance(data, dict) or data.get("format_version") != 1:
+            raise InputError("not a calibration of format version 1", file=path, remedy="calibrate again")
+        return check(data, cls, path)
 
 
 def _pose(matrix: F64) -> Pose:

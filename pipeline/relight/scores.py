@@ -48,7 +48,7 @@ def _block_sums(values: F64, mask: NDArray[np.bool_]) -> F64:
     """(L, N) values on the mask's pixels -> sums over wavelengths and BLOCK x BLOCK pixels, 1-D."""
     rows, columns = np.nonzero(mask)
     block = (rows // BLOCK) * (mask.shape[1] // BLOCK + 1) + columns // BLOCK
-    return np.bincount(block, weights=values.sum(axis=0))
+    return np.bincount(block, weights=values.sum(axis=0)).astype(np.float64)
 
 
 def _tone(image: F64, exposure: float) -> F64:

@@ -1,0 +1,171 @@
+"""Light -> transmitted flux per vertex: q_u, the input of the reflectance model.
+
+T(x) = integral L(x, w) F_t(w) cos dw is what passes the boundary at x (W/mm^2); the moment of a vertex is
+integral hat_u(x) T(x) dA. Flat faces and their true normals are used throughout, so that power is conserved exactly;
+shadows come from rays. Lights of one direction per point have sharp edges (of the light, of its texture, of shadows):
+cells that an edge crosses are split until what is left is below a tolerance. Lights from many directions are smooth
+on the surface and sharp in direction: a fixed grid of points, many directions each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import linalg as sparse_linalg
+
+from pipeline.calibrate.fresnel import transmittance
+from pipeline.relight.arrival import colour, feature_mm, from_many_directions, from_one_direction
+from pipeline.relight.lights import Environment, Light, Uniform
+from pipeline.relight.surface import F64, Int, Surface
+
+if TYPE_CHECKING:
+    import trimesh
+
+_RULE = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4]]) / 6  # three points, exact to the second degree
+_HALVES = 0.5 * np.array(
+    [
+        [[2, 0, 0], [1, 1, 0], [1, 0, 1]],
+        [[1, 1, 0], [0, 2, 0], [0, 1, 1]],
+        [[1, 0, 1], [0, 1, 1], [0, 0, 2]],
+        [[0, 1, 1], [1, 0, 1], [1, 1, 0]],
+    ]
+)  # corners of the four halves-size children in the parent's barycentric coordinates
+_CHUNK = 1 << 20  # rays at once
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How finely to integrate. The defaults keep the error well below that of a 642-vertex mesh's shape.
+
+    tolerance:  estimated error of the vertex moments left by the last split, as a share of the total flux
+    splits:     largest number of splits of a cell
+    directions: per point, for lights from many directions
+    """
+
+    tolerance: float = 1e-3
+    splits: int = 8
+    directions: int = 256
+
+
+def received(
+    surface: Surface, light: Light, face: Int, points: F64, eta: float, lasers: int, directions: int = 256
+) -> NDArray[np.float64]:
+    """(L, N) transmitted flux density T in W/mm^2 at (N, 3) points on (N,) faces. eta = 1: the plain irradiance."""
+    if isinstance(light, Uniform | Environment):
+        return _received_from_many(surface, light, face, points, eta, lasers, directions)
+    towards, across = from_one_direction(light, points)
+    cosine = (towards * surface.normals[face]).sum(axis=1)
+    density = np.where(cosine > 0, across * transmittance(cosine, eta) * cosine, 0.0)
+    lit = np.flatnonzero(density > 0)
+    density[lit[surface.blocked(face[lit], points[lit], towards[lit])]] = 0.0
+    return np.asarray(colour(light, lasers)[:, None] * density)
+
+
+def _received_from_many(
+    surface: Surface, light: Uniform | Environment, face: Int, points: F64, eta: float, lasers: int, count: int
+) -> F64:
+    total = np.zeros((lasers, len(face)))
+    step = max(1, _CHUNK // count)
+    for start in range(0, len(face), step):
+        part = slice(start, start + step)
+        f, p = face[part], points[part]
+        normals = surface.normals[f]
+        for towards, weight in from_many_directions(light, normals, count, lasers):
+            cosine = np.einsum("nkx,nx->nk", towards, normals)
+            ft = transmittance(cosine, eta)
+            ask = np.nonzero((ft > 0) & ~surface.free[f][:, None])
+            hidden = surface.blocked(f[ask[0]], p[ask[0]], towards[ask])
+            ft[ask[0][hidden], ask[1][hidden]] = 0.0
+            total[:, part] += np.einsum("lnk,nk->ln", weight, ft)
+    return total
+
+
+def irradiance(light: Light, mesh: trimesh.Trimesh, face: Int, points: F64, lasers: int) -> NDArray[np.float64]:
+    """(L, N) plain irradiance in W/mm^2 at (N, 3) points on (N,) faces: no boundary, shadows of the mesh included."""
+    return received(Surface.of(mesh), light, face, points, 1.0, lasers, directions=1024)
+
+
+def _first_cells(surface: Surface, longest: float) -> tuple[Int, F64]:
+    """Cells (C,) faces and (C, 3, 3) corners in barycentric coordinates, no edge longer than `longest` mm."""
+    edges = surface.corners - np.roll(surface.corners, 1, axis=1)
+    length = np.linalg.norm(edges, axis=2).max(axis=1)
+    splits = np.clip(np.ceil(np.log2(length / longest)), 0, 10).astype(int)
+    faces, corners = [], []
+    for level in np.unique(splits):
+        face = np.flatnonzero(splits == level)
+        bary = np.broadcast_to(np.eye(3), (len(face), 3, 3))
+        for _ in range(level):
+            face, bary = _split(face, bary)
+        faces.append(face)
+        corners.append(bary)
+    return np.concatenate(faces), np.concatenate(corners)
+
+
+def _split(face: Int, bary: F64) -> tuple[Int, F64]:
+    """Cells -> four children each, the children of a cell next to each other."""
+    return np.repeat(face, 4), np.einsum("kij,cjb->ckib", _HALVES, bary).reshape(-1, 3, 3)
+
+
+def _moments(
+    surface: Surface, light: Light, face: Int, bary: F64, eta: float, lasers: int, directions: int
+) -> NDArray[np.float64]:
+    """(L, C, 3) integrals of T times the face's three hat functions over each cell, in W."""
+    at = np.einsum("pj,cjb->cpb", _RULE, bary)  # (C, 3 points, 3)
+    flat = at.reshape(-1, 3)
+    owner = np.repeat(face, 3)
+    density = received(surface, light, owner, surface.points(owner, flat), eta, lasers, directions)
+    area = surface.areas[face] * np.abs(np.linalg.det(bary)) / 3
+    return np.asarray(np.einsum("lcp,cpb,c->lcb", density.reshape(lasers, -1, 3), at, area))
+
+
+def hat_moments(
+    light: Light, mesh: trimesh.Trimesh, eta: float, lasers: int, accuracy: Accuracy | None = None
+) -> NDArray[np.float64]:
+    """(L, V) integrals of hat_u T dA in W; they add up to all the flux that passes the boundary."""
+    accuracy = accuracy or Accuracy()
+    surface = Surface.of(mesh)
+    many = isinstance(light, Uniform | Environment)
+    longest = surface.size / (12 if many else 40)
+    feature = feature_mm(light)
+    face, bary = _first_cells(surface, longest if feature is None else min(longest, feature / 4))
+    total = np.zeros((lasers, surface.vertices))
+
+    def add(owner: Int, part: F64) -> None:
+        for laser in range(lasers):
+            total[laser] += np.bincount(surface.faces[owner].ravel(), part[laser].ravel(), surface.vertices)
+
+    coarse = _moments(surface, light, face, bary, eta, lasers, accuracy.directions)
+    for _ in range(0 if many else accuracy.splits):
+        kids, kid_bary = _split(face, bary)
+        fine = _moments(surface, light, kids, kid_bary, eta, lasers, accuracy.directions)
+        better = fine.reshape(lasers, len(face), 4, 3).sum(axis=2)
+        error = np.abs(better - coarse).sum(axis=2).max(axis=0)
+        allowed = accuracy.tolerance * float((total.sum(axis=1) + better.sum(axis=(1, 2))).max())
+        order = np.argsort(error)
+        again = np.zeros(len(face), bool)
+        again[order[np.cumsum(error[order]) > allowed]] = True
+        add(face[~again], better[:, ~again])
+        chosen = np.repeat(again, 4)
+        face, bary, coarse = kids[chosen], kid_bary[chosen], fine[:, chosen]
+        if not len(face):
+            break
+    add(face, coarse)
+    return total
+
+
+def transmitted_flux(
+    light: Light, mesh: trimesh.Trimesh, eta: float, lasers: int, accuracy: Accuracy | None = None
+) -> NDArray[np.float64]:
+    """(L, V) flux q in W for radiosity = sum_u R_d[u, :] q_u, with R_d averaged over hat functions.
+
+    q = A M^-1 (moments), with the mass matrix M and the vertex areas A: the flux density is projected onto the hat
+    functions and multiplied by their areas. The sum over the vertices is the total transmitted flux. See
+    docs/decisions/0005-flux-projection.md for why.
+    """
+    moments = hat_moments(light, mesh, eta, lasers, accuracy)
+    surface = Surface.of(mesh)
+    density = sparse_linalg.spsolve(surface.mass_matrix(), moments.T).reshape(surface.vertices, lasers)
+    return np.asarray((density * surface.vertex_areas()[:, None]).T)

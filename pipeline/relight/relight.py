@@ -1,0 +1,63 @@
+"""Radiosity on the vertices -> images: thesis eq. 2.1's outer half, L(x_o, w_o) = F_t(w_o) / pi * B(x_o)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from pipeline.calibrate.camera import PinholeCamera
+from pipeline.calibrate.fresnel import transmittance
+from pipeline.relight.surface import Surface
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+@dataclass(frozen=True)
+class ViewMatrix:
+    """A camera's view of a mesh, once for all lights.
+
+    matrix:   (H * W, V) sparse, 1/sr: radiance of a pixel per radiosity of a vertex; pixels row by row
+    coverage: (H, W) share of the pixel that the object fills, 0..1
+    """
+
+    matrix: sparse.csr_matrix
+    coverage: NDArray[np.float64]
+
+    def image(self, radiosity: NDArray[np.float64]) -> NDArray[np.float32]:
+        """(L, V) radiosity in W/mm^2 -> (L, H, W) radiance in W/(mm^2 sr), averaged over each pixel."""
+        flat = np.asarray(self.matrix @ np.asarray(radiosity, np.float64).T)
+        return np.moveaxis(flat.reshape(*self.coverage.shape, -1), -1, 0).astype(np.float32)
+
+
+def view_matrix(mesh: trimesh.Trimesh, camera: PinholeCamera, eta: float, supersample: int = 4) -> ViewMatrix:
+    """Trace supersample^2 rays a pixel. Radiosity is linear on faces; F_t uses the interpolated vertex normals,
+    which stand for the smooth object better than the faces of its mesh do."""
+    surface = Surface.of(mesh)
+    origins, directions = camera.rays(camera.pixel_centres(supersample))
+    face, bary = surface.first_hit(origins, directions)
+    hit = np.flatnonzero(face >= 0)
+    corners = surface.faces[face[hit]]
+    normal = np.einsum("nk,nkx->nx", bary[hit], np.asarray(mesh.vertex_normals)[corners])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    cosine = -(normal * directions[hit]).sum(axis=1)
+    factor = transmittance(cosine, eta) / np.pi / supersample**2
+    width, height = camera.width, camera.height
+    row, column = hit // (width * supersample) // supersample, hit % (width * supersample) // supersample
+    pixel = row * width + column
+    weights = (factor[:, None] * bary[hit]).ravel()
+    shape = (width * height, surface.vertices)
+    matrix = sparse.csr_matrix((weights, (np.repeat(pixel, 3), corners.ravel())), shape=shape)
+    coverage = np.bincount(pixel, minlength=width * height).reshape(height, width) / supersample**2
+    return ViewMatrix(matrix, coverage)
+
+
+def relit_image(
+    radiosity: NDArray[np.float64], mesh: trimesh.Trimesh, camera: PinholeCamera, eta: float, supersample: int = 4
+) -> NDArray[np.float32]:
+    """(L, V) radiosity in W/mm^2 -> (L, H, W) radiance in W/(mm^2 sr). For several lights keep the `view_matrix`."""
+    return view_matrix(mesh, camera, eta, supersample).image(radiosity)
