@@ -5,15 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from disco_twin.object.schema import ObjectConfig
 from pipeline.config import Strict, load_toml
 from pipeline.reconstruct.settings import ReconstructConfig
-from pipeline.relight.lights import Light
+from pipeline.relight.lights import Colour, Light
 from pipeline.rig import CameraConfig, RigConfig
 
 Count = Annotated[int, Field(ge=1, le=10**10)]
+Profile = Literal["full", "small"]
 
 
 class ScanConfig(Strict):
@@ -23,25 +24,25 @@ class ScanConfig(Strict):
 
 
 class SimulationConfig(Strict):
-    """How much light is traced. Fewer walks: faster, noisier (noise goes with the square root)."""
+    """How much light is traced; the noise goes with the inverse square root of the walks."""
 
     walks_per_spot: Count = 200_000
-    truth_columns: Count = 24  # scan vertices whose R_d column is computed as ground truth
-    truth_walks: Count = 2_000_000  # per column
-    reference_walks: Count = 20_000_000  # per light and half
+    truth_columns: Count = 24  # scan vertices whose column of R_d is computed as ground truth
+    truth_walks: Count = 2_000_000  # a column
+    reference_walks: Count = 20_000_000  # a light, both halves together
 
 
 class RelightConfig(Strict):
     """What the model is tried on: lights, and held-out cameras in the object frame."""
 
     lights: tuple[Light, ...] = ()
-    views: Annotated[tuple[CameraConfig, ...], Field(min_length=1, max_length=16)]
+    views: Annotated[tuple[CameraConfig, ...], Field(min_length=2, max_length=16)]
 
 
 class Scene(Strict):
     """Everything about one run."""
 
-    format_version: Literal[1] = 1
+    format_version: Literal[1]
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     object: ObjectConfig
@@ -51,7 +52,58 @@ class Scene(Strict):
     reconstruct: ReconstructConfig = ReconstructConfig()
     relight: RelightConfig
 
+    @model_validator(mode="after")
+    def _consistent(self) -> Scene:
+        lasers = len(self.rig.lasers)
+        for key, values in self.object.medium.per_wavelength():
+            if len(values) not in (1, lasers):
+                raise ValueError(f"object.medium.{key} has {len(values)} values for {lasers} lasers")
+        for light in self.relight.lights:
+            if any(len(colour) != lasers for colour in _colours(light)):
+                raise ValueError(f"relight.lights: the colour of {light.name!r} needs {lasers} values, one a laser")
+        for what, names in (
+            ("relight.lights", [light.name for light in self.relight.lights]),
+            ("relight.views and rig.cameras", [c.name for c in (*self.rig.cameras, *self.relight.views)]),
+        ):
+            if len(set(names)) < len(names):
+                raise ValueError(f"{what}: names must be distinct, found {', '.join(names)}")
+        if self.scan.vertices is not None and self.simulation.truth_columns > self.scan.vertices / 2:
+            raise ValueError(
+                f"simulation.truth_columns = {self.simulation.truth_columns}: more than half of scan.vertices"
+            )
+        return self
 
-def load_scene(path: str | Path) -> Scene:
-    """Read a scene; file names inside it are relative to its folder."""
-    return load_toml(path, Scene)
+
+def _colours(light: Light) -> list[Colour]:
+    return [light.constant, *(lobe.radiance for lobe in light.lobes)] if light.kind == "environment" else [light.colour]
+
+
+def load_scene(path: str | Path, profile: Profile = "full") -> Scene:
+    """Read a scene; file names inside it are relative to its folder. `small` shrinks it, see `shrink`."""
+    scene = load_toml(path, Scene)
+    return shrink(scene) if profile == "small" else scene
+
+
+def shrink(scene: Scene) -> Scene:
+    """The profile `small`: the same scene with a quarter of the pixels and of the spots and a tenth of the walks.
+
+    At least 20 spots, 16 pixels, 4 columns of truth and 1000 walks are left; geometry and media stay as they are.
+    """
+
+    def half(camera: CameraConfig) -> CameraConfig:
+        width, height = max(16, camera.width // 2), max(16, camera.height // 2)
+        pitch = camera.pixel_pitch_um * camera.width / width
+        return camera.model_copy(update={"width": width, "height": height, "pixel_pitch_um": pitch})
+
+    walks = scene.simulation
+    simulation = SimulationConfig(
+        walks_per_spot=max(1000, walks.walks_per_spot // 10),
+        truth_columns=min(walks.truth_columns, max(4, walks.truth_columns // 4)),
+        truth_walks=max(1000, walks.truth_walks // 10),
+        reference_walks=max(1000, walks.reference_walks // 10),
+    )
+    cameras = tuple(half(camera) for camera in scene.rig.cameras)
+    spots = min(scene.rig.spots, max(20, scene.rig.spots // 4))
+    rig = scene.rig.model_copy(update={"cameras": cameras, "spots": spots})
+    relight = scene.relight.model_copy(update={"views": tuple(half(view) for view in scene.relight.views)})
+    return scene.model_copy(update={"rig": rig, "relight": relight, "simulation": simulation})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -56,30 +57,93 @@ def check(data: dict[str, Any], schema: type[M], path: str | Path) -> M:
     try:
         return schema.model_validate(data, context={"folder": Path(path).resolve().parent})
     except ValidationError as error:
-        raise _one_line(error, data, path) from None
+        raise _one_line(error, data, schema, path) from None
 
 
-def _one_line(error: ValidationError, data: dict[str, Any], path: str | Path) -> InputError:
-    """The first problem of a pydantic error, an unknown key before a missing one: a typo causes both."""
-    problems = error.errors(include_url=False)
-    first = next((p for p in problems if p["type"] == "extra_forbidden"), problems[0])
-    key = _dotted(first["loc"], data)
-    remedy = None
-    if first["type"] == "extra_forbidden":
-        return InputError("unknown key", file=path, key=key, remedy=remedy)
-    return InputError(first["msg"].removeprefix("Value error, "), file=path, key=key, value=first["input"])
+def _one_line(error: ValidationError, data: dict[str, Any], schema: type[Strict], path: str | Path) -> InputError:
+    """The first problem of a pydantic error. Unknown keys go before missing ones, as a typo causes both."""
+    problem = min(error.errors(include_url=False), key=lambda p: _rank(p["type"]))
+    kind, location, context = problem["type"], problem["loc"], problem.get("ctx", {})
+    key = _dotted(location, data, keep_last=kind == "missing")
+    if kind == "extra_forbidden":
+        *parent, name = location
+        node = _node(schema.model_json_schema(), parent)
+        remedy = _nearest(str(name), node.get("properties", {}))
+        return InputError("unknown key", file=path, key=_dotted(location, data), remedy=remedy)
+    if kind == "missing":
+        return InputError("required key is missing", file=path, key=key)
+    if kind == "union_tag_not_found":
+        node = _node(schema.model_json_schema(), location)
+        tags = ", ".join(node.get("discriminator", {}).get("mapping", {}))
+        return InputError("required key is missing", file=path, key=f"{key}.kind", allowed=tags or None)
+    if kind == "union_tag_invalid":
+        tag, tags = context["tag"], context["expected_tags"].replace("'", "")
+        remedy = _nearest(tag, tags.split(", "))
+        return InputError("unknown kind", file=path, key=f"{key}.kind", value=tag, allowed=tags, remedy=remedy)
+    value = problem["input"] if isinstance(problem["input"], str | int | float | bool | list | tuple) else None
+    allowed = _allowed(_node(schema.model_json_schema(), location))
+    message = problem["msg"].removeprefix("Value error, ")
+    return InputError(message[0].lower() + message[1:], file=path, key=key or None, value=value, allowed=allowed)
 
 
-def _dotted(location: tuple[int | str, ...], data: Any) -> str:
-    """`rig.cameras[1].name` for the parts of a pydantic location that exist in the file (union tags do not)."""
+def _rank(kind: str) -> int:
+    """Of a union's members all report; a value out of range says more than `is not of the other member's type`."""
+    return 0 if kind == "extra_forbidden" else 2 if kind.endswith("_type") else 1
+
+
+def _dotted(location: tuple[int | str, ...], data: Any, keep_last: bool = True) -> str:
+    """`rig.cameras[1].name` from a pydantic location, without the parts that are tags of unions."""
     out = ""
     for i, part in enumerate(location):
         if isinstance(part, int):
             out += f"[{part}]"
             data = data[part] if isinstance(data, list | tuple) and part < len(data) else None
-        elif isinstance(data, dict) and part not in data and i < len(location) - 1:
-            continue  # the tag of a discriminated union
-        else:
+        elif isinstance(data, dict) and (part in data or (keep_last and i == len(location) - 1)):
             out += f".{part}" if out else part
-            data = data.get(part) if isinstance(data, dict) else None
+            data = data.get(part)
     return out
+
+
+def _nearest(name: str, valid: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name, valid, 1, cutoff=0.5)
+    return f"did you mean {near[0]!r}?" if near else f"use one of {', '.join(valid)}"
+
+
+def _node(root: dict[str, Any], location: Iterable[int | str]) -> dict[str, Any]:
+    """The part of a JSON schema that a pydantic location points to."""
+
+    def follow(node: dict[str, Any]) -> dict[str, Any]:
+        while "$ref" in node:
+            node = root["$defs"][node["$ref"].rsplit("/", 1)[1]]
+        return node
+
+    node = root
+    for part in location:
+        tagged = node.get("discriminator", {}).get("mapping", {})
+        options = [follow(option) for option in node.get("anyOf", [])] or [node]
+        if part in tagged:
+            node = follow({"$ref": tagged[part]})
+        elif isinstance(part, int):
+            arrays = [option for option in options if option.get("type") == "array"]
+            fixed = arrays[0].get("prefixItems", []) if arrays else []
+            node = follow(fixed[part] if part < len(fixed) else arrays[0].get("items", {})) if arrays else {}
+        else:
+            inside = [option["properties"][part] for option in options if part in option.get("properties", {})]
+            node = follow(inside[0]) if inside else node  # otherwise the tag of a plain union
+    return node
+
+
+def _allowed(node: dict[str, Any]) -> str | None:
+    """The range that a JSON schema's node states, in words."""
+    node = next((option for option in node.get("anyOf", []) if option.get("type") != "null"), node)
+    signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
+    words = [f"{sign} {node[key]:g}" for key, sign in signs.items() if key in node]
+    words += [f"at {bound} {node[key]} values" for key, bound in _LENGTHS.items() if key in node]
+    if "enum" in node:
+        words.append(", ".join(map(str, node["enum"])))
+    if "pattern" in node:
+        words.append(f"pattern {node['pattern']}")
+    return " and ".join(words) or None
+
+
+_LENGTHS = {"minItems": "least", "maxItems": "most"}

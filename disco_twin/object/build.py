@@ -9,8 +9,8 @@ import trimesh
 
 from disco_twin.object import shapes
 from disco_twin.object.media import Medium, build_medium
-from disco_twin.object.mesh import hat_basis, remesh
-from disco_twin.object.schema import Box, ObjectConfig, Pebble, Sphere, Torus
+from disco_twin.object.mesh import hat_basis, read_mesh, remesh
+from disco_twin.object.schema import Box, MeshFile, ObjectConfig, Pebble, Sphere
 from disco_twin.scene import Scene
 
 __all__ = ["Boundary", "Medium", "TwinObject", "build_object", "build_scan", "hat_basis"]
@@ -42,22 +42,28 @@ def build_object(scene: Scene) -> TwinObject:
     boundary = Boundary(
         kind, 1.0 if kind == "matched" else config.boundary.eta, config.boundary.alpha if kind == "rough" else 0.0
     )
-    return TwinObject(mesh, boundary, build_medium(config.medium, mesh, len(scene.rig.lasers)))
+    wavelengths = [laser.wavelength_nm for laser in scene.rig.lasers]
+    return TwinObject(mesh, boundary, build_medium(config.medium, mesh, wavelengths))
 
 
 def build_scan(scene: Scene, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The mesh that the pipeline is given: `mesh` itself, or one of about `scan.vertices` vertices."""
-    return mesh if scene.scan.vertices is None else remesh(mesh, scene.scan.vertices)
+    vertices, shape = scene.scan.vertices, scene.object.shape
+    if vertices is None:
+        return mesh
+    if isinstance(shape, Box):
+        return shapes.box(shape, triangles=2 * vertices)  # keeps the edges sharp
+    return remesh(mesh, vertices)
 
 
 def _mesh(config: ObjectConfig) -> trimesh.Trimesh:
     shape = config.shape
+    if isinstance(shape, MeshFile):
+        return read_mesh(shape.file)
     if isinstance(shape, Pebble):
         return shapes.pebble(shape)
     if isinstance(shape, Sphere):
         return shapes.sphere(shape)
     if isinstance(shape, Box):
         return shapes.box(shape)
-    if isinstance(shape, Torus):
-        return shapes.torus(shape)
-    raise NotImplementedError(shape.kind)
+    return shapes.torus(shape)

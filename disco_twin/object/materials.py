@@ -2,6 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+CHANNELS_NM = (635.0, 532.0, 476.0)  # which laser stands for the table's red, green and blue
+
 # name: (sigma_s' for R, G, B, sigma_a for R, G, B) in 1/mm
 MATERIALS: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
     "marble": ((2.19, 2.62, 3.00), (0.0021, 0.0041, 0.0071)),
@@ -13,3 +21,14 @@ MATERIALS: dict[str, tuple[tuple[float, float, float], tuple[float, float, float
     "apple": ((2.29, 2.39, 1.97), (0.0030, 0.0034, 0.046)),
     "potato": ((0.68, 0.70, 0.55), (0.0024, 0.0090, 0.12)),
 }
+
+
+def measured(name: str, wavelengths_nm: Sequence[float]) -> tuple[F64, F64]:
+    """(L,) sigma_t in 1/mm and (L,) albedo of a material at each laser, taken from the nearest of R, G and B.
+
+    By similarity sigma_s' stands for sigma_s with g = 0, so sigma_t = sigma_s' + sigma_a.
+    """
+    distance = np.abs(np.subtract.outer(np.asarray(wavelengths_nm, float), np.array(CHANNELS_NM)))
+    channel = np.argmin(distance, axis=1)
+    scatter, absorb = (np.array(values)[channel] for values in MATERIALS[name])
+    return scatter + absorb, scatter / (scatter + absorb)

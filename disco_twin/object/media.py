@@ -1,33 +1,27 @@
-"""Media: per-wavelength grids of sigma_t and albedo from a homogeneous base, a measured material or voxel files.
+"""Media: sigma_t and albedo per wavelength on a grid, from a homogeneous base, a measured material or voxel files.
 
-Features are laid over the base in order. A feature covers each cell to a share w in 0 .. 1 (a soft edge one cell wide)
-and is mixed in linearly in sigma_s and sigma_a, so that a thin feature keeps its optical thickness.
+Features are laid over the base in order, each mixed in linearly in sigma_s and sigma_a by the share of the voxel that
+it covers, so that a sheet thinner than a voxel keeps its optical thickness.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from disco_twin.object.materials import MATERIALS
-from disco_twin.object.mesh import closest, depth
-from disco_twin.object.schema import (
-    Crack,
-    Feature,
-    HollowCore,
-    Homogeneous,
-    Layers,
-    Material,
-    MediumConfig,
-    Patch,
-    Veins,
-)
+from disco_twin.object.features import coverage
+from disco_twin.object.materials import measured
+from disco_twin.object.schema import Grid, HollowCore, Homogeneous, MediumConfig
+from disco_twin.object.voxels import read_voxels
 from hw.errors import InputError
 
 F64 = NDArray[np.float64]
+KEY = "object.medium"
+MOST_CELLS = 30_000_000  # 360 MB a wavelength while the medium is built
 
 
 @dataclass(frozen=True)
@@ -45,146 +39,103 @@ class Medium:
     g: tuple[float, ...]
 
 
-def build_medium(config: MediumConfig, mesh: trimesh.Trimesh, lasers: int) -> Medium:
-    """The medium that fills `mesh`."""
-    g = tuple(float(x) for x in per_wavelength(config.g, lasers, "object.medium.g"))
+def build_medium(config: MediumConfig, mesh: trimesh.Trimesh, wavelengths_nm: Sequence[float]) -> Medium:
+    """The medium that fills `mesh`, for each of the lasers."""
+    base = _base(config, mesh, wavelengths_nm)
+    return _with_features(config, base, mesh) if config.features else base
+
+
+def _base(config: MediumConfig, mesh: trimesh.Trimesh, wavelengths_nm: Sequence[float]) -> Medium:
+    lasers = len(wavelengths_nm)
+    g = tuple(float(x) for x in _per_wavelength(config.g, lasers))
+    low, high = np.array(mesh.bounds, dtype=float)
     base = config.base
-    low, high = mesh.bounds[0].astype(float), mesh.bounds[1].astype(float)
+    if isinstance(base, Grid):
+        return _grid(base, mesh, lasers, g)
     if isinstance(base, Homogeneous):
-        sigma_t = per_wavelength(base.sigma_t_per_mm, lasers, "object.medium.base.sigma_t_per_mm")
-        albedo = per_wavelength(base.albedo, lasers, "object.medium.base.albedo")
-    elif isinstance(base, Material):
-        sigma_t, albedo = material(base.name, lasers)
+        sigma_t, albedo = _per_wavelength(base.sigma_t_per_mm, lasers), _per_wavelength(base.albedo, lasers)
     else:
-        raise NotImplementedError("grid")
-    shape = (1, 1, 1)
-    if config.features:
-        low, high = low - config.cell_mm, high + config.cell_mm
-        cells = np.ceil((high - low) / config.cell_mm).astype(int)
-        high = low + cells * config.cell_mm
-        shape = (cells[2], cells[1], cells[0])
-    sigma_s = np.ones((lasers, *shape)) * (sigma_t * albedo)[:, None, None, None]
-    sigma_a = np.ones((lasers, *shape)) * (sigma_t * (1 - albedo))[:, None, None, None]
-    if config.features:
-        centres = cell_centres(low, high, shape)
-        cell = float(((high - low) / np.array(shape)[::-1]).max())
-        for i, feature in enumerate(config.features):
-            key = f"object.medium.features[{i}]"
-            weight = coverage(feature, centres, cell, mesh).reshape(shape)
-            t, a = feature_optics(feature, lasers, key)
-            sigma_s += weight * ((t * a)[:, None, None, None] - sigma_s)
-            sigma_a += weight * ((t * (1 - a))[:, None, None, None] - sigma_a)
+        sigma_t, albedo = measured(base.name, wavelengths_nm)
+    return Medium(_column(sigma_t).astype(np.float32), _column(albedo).astype(np.float32), low, high, g)
+
+
+def _grid(base: Grid, mesh: trimesh.Trimesh, lasers: int, g: tuple[float, ...]) -> Medium:
+    key = f"{KEY}.base"
+    density = read_voxels(base.sigma_t_file, lasers, f"{key}.sigma_t_file")
+    albedo: NDArray[np.floating]
+    if base.albedo_file is not None:
+        albedo = read_voxels(base.albedo_file, lasers, f"{key}.albedo_file", highest=1.0).values
+        if albedo.shape[1:] != density.values.shape[1:]:
+            problem = f"the albedo grid is {albedo.shape[1:]}, sigma_t is {density.values.shape[1:]} (nz, ny, nx)"
+            raise InputError(problem, file=base.albedo_file, key=f"{key}.albedo_file")
+    else:
+        assert base.albedo is not None  # the schema asks for exactly one of the two
+        albedo = _column(_per_wavelength(base.albedo, lasers))
+    low = density.low if base.low_mm is None else np.array(base.low_mm)
+    high = density.high if base.high_mm is None else np.array(base.high_mm)
+    if low is None or high is None:
+        raise InputError("required for a .npy grid: its x, y, z corners in mm", key=f"{key}.low_mm and high_mm")
+    tolerance = 1e-6 * mesh.extents
+    if (mesh.bounds[0] < low - tolerance).any() or (mesh.bounds[1] > high + tolerance).any():
+        problem = f"the grid from {_mm(low)} to {_mm(high)} mm does not cover the object"
+        needed = f"low_mm <= {_mm(mesh.bounds[0])}, high_mm >= {_mm(mesh.bounds[1])}"
+        remedy = "set low_mm and high_mm to the corners of the outermost voxels"
+        raise InputError(problem, file=base.sigma_t_file, key=key, allowed=needed, remedy=remedy)
+    shape = (lasers, *density.values.shape[1:])
+    sigma_t, albedo = (np.broadcast_to(v, shape).astype(np.float32) for v in (density.values, albedo))
+    return Medium(sigma_t, albedo, low, high, g)
+
+
+def _with_features(config: MediumConfig, base: Medium, mesh: trimesh.Trimesh) -> Medium:
+    """Lay the features over the base: on its own voxels if it is a grid, else on voxels of `cell_mm`."""
+    lasers, shape = len(base.g), base.sigma_t.shape[1:]
+    low, high = base.low, base.high
+    if not isinstance(config.base, Grid):
+        cells = np.ceil((high - low) / config.cell_mm).astype(int) + 2  # one more on each side
+        if np.prod(cells.astype(float)) > MOST_CELLS:
+            problem = f"the medium would have {np.prod(cells.astype(float)):.3g} voxels"
+            key, most = f"{KEY}.cell_mm", f"at most {MOST_CELLS:.3g} voxels"
+            raise InputError(problem, key=key, value=config.cell_mm, allowed=most, remedy="use larger voxels")
+        low, high = (low + high - cells * config.cell_mm) / 2, (low + high + cells * config.cell_mm) / 2
+        shape = (int(cells[2]), int(cells[1]), int(cells[0]))
+    sigma_t, albedo = (np.asarray(v, float) for v in (base.sigma_t, base.albedo))
+    sigma_s = np.broadcast_to(sigma_t * albedo, (lasers, *shape)).copy()
+    sigma_a = np.broadcast_to(sigma_t * (1 - albedo), (lasers, *shape)).copy()
+    centres = cell_centres(low, high, shape)
+    cell = float(np.max((high - low) / np.array(shape[::-1])))
+    for i, feature in enumerate(config.features):
+        weight = coverage(feature, centres, cell, mesh).reshape(shape)
+        if not weight.any():
+            problem = f"the {feature.kind} lies outside the object, which spans {_mm(low)} to {_mm(high)} mm"
+            raise InputError(problem, key=f"{KEY}.features[{i}]", remedy="move it, or take it out")
+        if isinstance(feature, HollowCore):
+            t = a = np.zeros((lasers, 1, 1, 1))
+        else:
+            t = _column(_per_wavelength(feature.sigma_t_per_mm, lasers))
+            a = _column(_per_wavelength(feature.albedo, lasers))
+        sigma_s += weight * (t * a - sigma_s)
+        sigma_a += weight * (t * (1 - a) - sigma_a)
     total = sigma_s + sigma_a
     ratio = np.divide(sigma_s, total, out=np.zeros_like(total), where=total > 0)
-    return Medium(total.astype(np.float32), ratio.astype(np.float32), low, high, g)
+    return Medium(total.astype(np.float32), ratio.astype(np.float32), low, high, base.g)
 
 
-def per_wavelength(value: float | tuple[float, ...], lasers: int, key: str) -> F64:
-    """(L,) values from one for all lasers or one a laser."""
-    out = np.atleast_1d(np.asarray(value, float))
-    if len(out) not in (1, lasers):
-        raise InputError(f"{len(out)} values for {lasers} lasers", key=key, value=value, allowed=f"1 or {lasers} values")
-    return np.array(np.broadcast_to(out, (lasers,)))
-
-
-def material(name: str, lasers: int) -> tuple[F64, F64]:
-    """(L,) sigma_t = sigma_s' + sigma_a in 1/mm and (L,) albedo of a measured material (similarity: g = 0)."""
-    if lasers != 3:
-        raise InputError("measured materials have three wavelengths", key="object.medium.base.name", value=name)
-    scatter, absorb = (np.array(x) for x in MATERIALS[name])
-    return scatter + absorb, scatter / (scatter + absorb)
-
-
-def feature_optics(feature: Feature, lasers: int, key: str) -> tuple[F64, F64]:
-    """(L,) sigma_t in 1/mm and (L,) albedo of a feature."""
-    if isinstance(feature, HollowCore):
-        return np.zeros(lasers), np.zeros(lasers)
-    return (
-        per_wavelength(feature.sigma_t_per_mm, lasers, f"{key}.sigma_t_per_mm"),
-        per_wavelength(feature.albedo, lasers, f"{key}.albedo"),
-    )
-
-
-def cell_centres(low: F64, high: F64, shape: tuple[int, int, int]) -> F64:
-    """(nz * ny * nx, 3) x, y, z of the cell centres, x fastest."""
-    z, y, x = (lo + (np.arange(n) + 0.5) * (hi - lo) / n for lo, hi, n in zip(low[::-1], high[::-1], shape, strict=True))
+def cell_centres(low: F64, high: F64, shape: tuple[int, ...]) -> F64:
+    """(nz * ny * nx, 3) x, y, z of the cell centres of a (nz, ny, nx) grid, x fastest."""
+    z, y, x = (a + (np.arange(n) + 0.5) * (b - a) / n for a, b, n in zip(low[::-1], high[::-1], shape, strict=True))
     zz, yy, xx = np.meshgrid(z, y, x, indexing="ij")
     return np.column_stack([xx.ravel(), yy.ravel(), zz.ravel()])
 
 
-# ---------------------------------------------------------------- features: share of each cell that they cover
-def coverage(feature: Feature, points: F64, cell: float, mesh: trimesh.Trimesh) -> F64:
-    """(N,) share 0 .. 1 of a cell of edge `cell` around each of the (N, 3) points that the feature covers."""
-    if isinstance(feature, Veins):
-        return _sheet(_foam(points, feature.spacing_mm, feature.seed), feature.width_mm, cell)
-    if isinstance(feature, Crack):
-        return _crack(feature, points, cell)
-    if isinstance(feature, Layers):
-        along = (points @ _unit(feature.direction) - feature.offset_mm) % feature.period_mm
-        middle = feature.share * feature.period_mm / 2
-        gap = np.abs((along - middle + feature.period_mm / 2) % feature.period_mm - feature.period_mm / 2)
-        return _sheet(gap, feature.share * feature.period_mm, cell)
-    if isinstance(feature, HollowCore):
-        return _soft(feature.radius_mm - np.linalg.norm(points - feature.centre_mm, axis=1), cell)
-    return _patch(feature, points, cell, mesh)
+def _per_wavelength(value: ArrayLike, lasers: int) -> F64:
+    """(L,) values from one for all lasers or one a laser (the scene's schema has checked the count)."""
+    return np.array(np.broadcast_to(np.atleast_1d(np.asarray(value, float)), (lasers,)))
 
 
-def _soft(depth: F64, cell: float) -> F64:
-    """Share covered where the feature's edge lies `depth` away (positive: inside), ramp one cell wide."""
-    return np.clip(depth / cell + 0.5, 0, 1)
+def _column(values: F64) -> F64:
+    """(L,) -> (L, 1, 1, 1)."""
+    return values[:, None, None, None]
 
 
-def _sheet(distance: F64, width: float, cell: float) -> F64:
-    """Share covered by a sheet of `width` whose mid-surface is `distance` >= 0 away: overlap of two intervals."""
-    overlap = np.minimum(distance + cell / 2, width / 2) - np.maximum(distance - cell / 2, -width / 2)
-    return np.clip(overlap / cell, 0, 1)
-
-
-def _unit(v: tuple[float, float, float]) -> F64:
-    return np.asarray(v, float) / np.linalg.norm(v)
-
-
-def _foam(points: F64, spacing: float, seed: int) -> F64:
-    """(N,) distance to the walls of a warped Voronoi foam with about one cell per spacing^3."""
-    from scipy.spatial import cKDTree
-
-    random = np.random.default_rng(seed)
-    low, high = points.min(axis=0) - spacing, points.max(axis=0) + spacing
-    count = max(2, int(np.ceil(np.prod((high - low) / spacing))))
-    sites = random.uniform(low, high, size=(count, 3))
-    warped = points + 0.2 * spacing * _waves(points, spacing, random)
-    _, index = cKDTree(sites).query(warped, k=2)
-    near, next_ = sites[index[:, 0]], sites[index[:, 1]]
-    across = next_ - near
-    return np.abs(np.sum(((near + next_) / 2 - warped) * across, axis=1)) / np.linalg.norm(across, axis=1)
-
-
-def _waves(points: F64, length: float, random: np.random.Generator) -> F64:
-    """(N, 3) smooth displacements of about unit size and wavelength `length` or more: a few random plane waves."""
-    out = np.zeros_like(points)
-    for _ in range(4):
-        wave = random.normal(size=3)
-        wave *= 2 * np.pi / length * random.uniform(0.3, 0.8) / np.linalg.norm(wave)
-        out += 0.5 * np.sin(points @ wave + random.uniform(0, 2 * np.pi))[:, None] * random.normal(size=3)
-    return out
-
-
-def _crack(feature: Crack, points: F64, cell: float) -> F64:
-    normal = _unit(feature.normal)
-    offset = points - feature.through_mm
-    height = offset @ normal
-    inplane = offset - height[:, None] * normal
-    period = 2 * np.pi / max(feature.radius_mm, 1e-9)
-    height = height - feature.waviness_mm * np.sin(period * inplane @ np.array([0.7, 1.1, 0.9]))
-    sheet = _sheet(np.abs(height), feature.width_mm, cell)
-    return sheet * _soft(feature.radius_mm - np.linalg.norm(inplane, axis=1), cell)
-
-
-def _patch(feature: Patch, points: F64, cell: float, mesh: trimesh.Trimesh) -> F64:
-    centre = closest(mesh, np.array([feature.centre_mm]))[0][0]
-    ball = _soft(feature.radius_mm - np.linalg.norm(points - centre, axis=1), cell)
-    inside = ball > 0
-    out = np.zeros(len(points))
-    # Cells outside the object count as painted: interpolation at the surface must not mix in bare material.
-    out[inside] = ball[inside] * _soft(feature.depth_mm - depth(mesh, points[inside]), cell)
-    return out
+def _mm(point: F64) -> str:
+    return "(" + ", ".join(f"{x:.4g}" for x in point) + ")"

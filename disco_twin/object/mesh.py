@@ -2,13 +2,73 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import gpytoolbox
 import numpy as np
 import scipy.sparse
 import trimesh
 from numpy.typing import NDArray
 
+from hw.errors import InputError
+
 F64 = NDArray[np.float64]
+KEY = "object.shape.file"
+
+
+LARGEST_MM, SMALLEST_MM = 2000.0, 1.0  # extents that a rig of about 500 mm working distance can mean
+FINE_TRIANGLES = 20_000  # truth is tallied on the mesh's vertices: triangles are cut in four until there are so many
+
+
+def read_mesh(path: Path) -> trimesh.Trimesh:
+    """A closed, outward oriented mesh in mm from a PLY, OBJ or STL file; anything else is refused with its reason."""
+    if path.suffix.lower() not in (".ply", ".obj", ".stl"):
+        raise InputError("unknown type of mesh file", file=path, key=KEY, allowed=".ply, .obj, .stl")
+    try:
+        loaded = trimesh.load(path, force="mesh", process=False)
+    except Exception as error:  # the loaders raise whatever their parsing trips over
+        raise InputError(f"cannot be read as a mesh: {error}", file=path, key=KEY) from error
+    faces = np.asarray(getattr(loaded, "faces", ()), dtype=np.int64).reshape(-1, 3)
+    if len(faces) == 0:
+        raise InputError("the mesh is empty (no triangles)", file=path, key=KEY)
+    if faces.min() < 0 or faces.max() >= len(loaded.vertices):
+        raise InputError("a triangle names a vertex that does not exist", file=path, key=KEY)
+    if not np.isfinite(np.asarray(loaded.vertices)[faces]).all():
+        raise InputError("a vertex is not a finite number", file=path, key=KEY)
+    # Vertices that files repeat per triangle (STL) or per texture seam (OBJ) are one vertex; slivers without area go.
+    mesh = trimesh.Trimesh(np.array(loaded.vertices), faces, process=False)
+    mesh.merge_vertices()
+    mesh.update_faces(mesh.nondegenerate_faces())
+    mesh.remove_unreferenced_vertices()
+    check_mesh(mesh, path)
+    while len(mesh.faces) < FINE_TRIANGLES:
+        mesh = trimesh.Trimesh(*trimesh.remesh.subdivide(mesh.vertices, mesh.faces), process=False)
+    return mesh
+
+
+def check_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
+    """Refuse a mesh that light cannot be traced in, or that was not meant in mm."""
+    if len(mesh.faces) == 0:
+        raise InputError("the mesh is empty (all its triangles are degenerate)", file=path, key=KEY)
+    size = float(mesh.extents.max())
+    if size < SMALLEST_MM:
+        remedy = "scale it by 1000 if it is in metres"
+        raise InputError(f"the mesh is {size:.3g} mm large", file=path, key=KEY, allowed=_SIZES, remedy=remedy)
+    if size > LARGEST_MM:
+        remedy = "scale it by 0.001 if it is in micrometres"
+        raise InputError(f"the mesh is {size:.3g} mm large", file=path, key=KEY, allowed=_SIZES, remedy=remedy)
+    if not mesh.is_watertight:
+        _, count = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+        problem = f"the mesh is not closed ({(count != 2).sum()} of {len(count)} edges do not join two triangles)"
+        raise InputError(problem, file=path, key=KEY, remedy="fill its holes")
+    if not mesh.is_winding_consistent:
+        raise InputError("the mesh's triangles are not all oriented the same way", file=path, key=KEY, remedy=_FLIP)
+    if mesh.volume <= 0:
+        raise InputError("the mesh is inside out", file=path, key=KEY, remedy=_FLIP)
+
+
+_SIZES = f"{SMALLEST_MM:g} .. {LARGEST_MM:g} mm"
+_FLIP = "recompute its normals outside"
 
 
 def closest(mesh: trimesh.Trimesh, points: F64) -> tuple[F64, NDArray[np.int64]]:
@@ -34,6 +94,9 @@ def remesh(mesh: trimesh.Trimesh, vertices: int) -> trimesh.Trimesh:
         if abs(len(v) / vertices - 1) < 0.01:
             break
         edge *= float(np.sqrt(len(v) / vertices))
+    if not (out.is_watertight and out.is_winding_consistent and out.volume > 0):
+        remedy = "raise scan.vertices, or leave it out to hand over the object's own mesh"
+        raise InputError("no closed mesh of so few vertices", key="scan.vertices", value=vertices, remedy=remedy)
     return out
 
 
@@ -50,7 +113,12 @@ def hat_basis(fine: trimesh.Trimesh, scan: trimesh.Trimesh) -> scipy.sparse.csr_
     rows = np.repeat(np.arange(len(weights)), 3)
     columns = np.asarray(scan.faces)[triangle].ravel()
     shape = (len(fine.vertices), len(scan.vertices))
-    return scipy.sparse.coo_matrix((weights.ravel(), (rows, columns)), shape=shape).tocsr()
+    basis = scipy.sparse.coo_matrix((weights.ravel(), (rows, columns)), shape=shape).tocsr()
+    empty = int((basis.sum(axis=0) <= 0).sum())
+    if empty:
+        problem = f"{empty} vertices of the scan are not resolved by the object's mesh"
+        raise InputError(problem, key="scan.vertices", remedy="lower scan.vertices, or give a finer mesh")
+    return basis
 
 
 def _arrays(mesh: trimesh.Trimesh) -> tuple[F64, NDArray[np.int32]]:

@@ -1,20 +1,30 @@
-"""The schema of `[object]` in a scene: shape, boundary, medium. Object frame, lengths in mm, wavelengths as in the rig."""
+"""The schema of `[object]` in a scene: shape, boundary, medium. Object frame, mm, wavelengths in the rig's order."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+import numpy as np
+from pydantic import AfterValidator, Field, model_validator
 
 from disco_twin.object.materials import MATERIALS
 from pipeline.config import NearbyFile, Strict
 from pipeline.rig import Point, Positive
+
+
+def _not_zero(vector: Point) -> Point:
+    if not any(vector):
+        raise ValueError("a direction cannot be zero")
+    return vector
+
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Coefficient = Annotated[float, Field(ge=0, le=1e4)]
 PerWavelength = Coefficient | tuple[Coefficient, ...]  # one value for all lasers, or one a laser
 Albedo = Share | tuple[Share, ...]
 Asymmetry = Annotated[float, Field(gt=-1, lt=1)]
+Direction = Annotated[Point, AfterValidator(_not_zero)]  # of any length
 Size = tuple[Positive, Positive, Positive]
 
 
@@ -140,7 +150,7 @@ class Crack(Strict):
     sigma_t_per_mm: PerWavelength
     albedo: Albedo = 0.0
     through_mm: Point = (0.0, 0.0, 0.0)
-    normal: Point = (1.0, 0.0, 0.0)
+    normal: Direction = (1.0, 0.0, 0.0)
     radius_mm: Positive = 10.0
     width_mm: Positive = 0.6
     waviness_mm: Annotated[float, Field(ge=0)] = 0.5
@@ -152,7 +162,7 @@ class Layers(Strict):
     kind: Literal["layers"]
     sigma_t_per_mm: PerWavelength
     albedo: Albedo
-    direction: Point = (0.0, 0.0, 1.0)
+    direction: Direction = (0.0, 0.0, 1.0)
     period_mm: Positive
     share: Annotated[float, Field(gt=0, lt=1)] = 0.5
     offset_mm: float = 0.0
@@ -181,12 +191,31 @@ Feature = Annotated[Veins | Crack | Layers | HollowCore | Patch, Field(discrimin
 
 
 class MediumConfig(Strict):
-    """`base` with `features` laid over it; `cell_mm` is the edge of the voxels that features are sampled on."""
+    """`base` with `features` laid over it in order.
+
+    `cell_mm` is the edge of the voxels that features are sampled on; a grid base keeps its own voxels.
+    """
 
     base: Base
     features: Annotated[tuple[Feature, ...], Field(max_length=32)] = ()
     g: Asymmetry | tuple[Asymmetry, ...] = 0.0
     cell_mm: Annotated[float, Field(ge=0.02, le=10)] = 0.5
+
+    @model_validator(mode="after")
+    def _reduced(self) -> MediumConfig:
+        if isinstance(self.base, Material) and np.any(self.g):
+            raise ValueError("a measured material states reduced scattering, it needs g = 0")
+        return self
+
+    def per_wavelength(self) -> Iterator[tuple[str, tuple[float, ...]]]:
+        """Keys and values of everything that is given once a laser."""
+        parts: list[tuple[str, Strict]] = [("", self), ("base.", self.base)]
+        parts += [(f"features[{i}].", feature) for i, feature in enumerate(self.features)]
+        for prefix, part in parts:
+            for name in ("sigma_t_per_mm", "albedo", "g"):
+                value = getattr(part, name, None)
+                if isinstance(value, tuple):
+                    yield prefix + name, value
 
 
 class ObjectConfig(Strict):

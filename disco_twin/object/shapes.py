@@ -53,14 +53,15 @@ def box(config: Box, triangles: int = 20_000) -> trimesh.Trimesh:
     size = np.array(config.size_mm)
     area = 2 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
     cells = np.maximum(1, np.round(size / np.sqrt(2 * area / triangles))).astype(int)
-    points, faces = [], []
+    points: list[NDArray[np.int64]] = []
+    faces: list[NDArray[np.int64]] = []
     for axis in range(3):
         a, b = (axis + 1) % 3, (axis + 2) % 3
         for side in (0, 1):
             i, j = np.meshgrid(np.arange(cells[a] + 1), np.arange(cells[b] + 1), indexing="ij")
             lattice = np.zeros((i.size, 3), dtype=np.int64)
             lattice[:, axis], lattice[:, a], lattice[:, b] = side * cells[axis], i.ravel(), j.ravel()
-            k = np.arange(i.size).reshape(i.shape) + sum(map(len, points))
+            k = np.arange(i.size).reshape(i.shape) + sum(len(p) for p in points)
             quads = np.stack([k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:]], axis=-1).reshape(-1, 4)
             quads = quads if side else quads[:, ::-1]
             faces += [quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]

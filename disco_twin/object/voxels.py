@@ -1,0 +1,79 @@
+"""Voxel files: NumPy's `.npy` and Mitsuba's `.vol`."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hw.errors import InputError
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Voxels:
+    """values: (C, nz, ny, nx) float32, C = 1 or one channel a laser; low, high: (3,) x, y, z corners or None."""
+
+    values: NDArray[np.float32]
+    low: F64 | None
+    high: F64 | None
+
+
+def read_voxels(path: Path, lasers: int, key: str, highest: float = np.inf) -> Voxels:
+    """Read and check a grid: finite, 0 .. `highest`, one channel or one a laser."""
+    if path.suffix == ".npy":
+        voxels = _read_npy(path, key)
+    elif path.suffix == ".vol":
+        voxels = _read_vol(path, key)
+    else:
+        raise InputError("unknown type of grid file", file=path, key=key, allowed=".npy or .vol")
+    values = voxels.values
+    if values.size == 0:
+        raise InputError("the grid is empty", file=path, key=key)
+    if len(values) not in (1, lasers):
+        problem = f"the grid has {len(values)} wavelengths for {lasers} lasers"
+        remedy = "store (nz, ny, nx) for all lasers, or (lasers, nz, ny, nx)"
+        raise InputError(problem, file=path, key=key, remedy=remedy)
+    for bad, what in ((~np.isfinite(values), "not a finite number"), (values < 0, "negative")):
+        if bad.any():
+            raise InputError(f"{_first(bad)} is {what} ({bad.sum()} in all)", file=path, key=key, allowed=">= 0")
+    if values.max() > highest:
+        problem = f"{_first(values > highest)} is too large, the largest is {values.max():g}"
+        raise InputError(problem, file=path, key=key, allowed=f"0 .. {highest:g}")
+    return voxels
+
+
+def _first(bad: NDArray[np.bool_]) -> str:
+    channel, z, y, x = (int(i) for i in np.argwhere(bad)[0])
+    return f"voxel z={z} y={y} x={x} of channel {channel}"
+
+
+def _read_npy(path: Path, key: str) -> Voxels:
+    try:
+        values = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise InputError(f"not a readable .npy file: {error}", file=path, key=key) from error
+    if not isinstance(values, np.ndarray) or values.ndim not in (3, 4) or values.dtype.kind not in "fiu":
+        raise InputError("not an array of real numbers (nz, ny, nx) or (lasers, nz, ny, nx)", file=path, key=key)
+    values = values.astype(np.float32)
+    return Voxels(values if values.ndim == 4 else values[None], None, None)
+
+
+def _read_vol(path: Path, key: str) -> Voxels:
+    """Mitsuba's grid volume, version 3: header of 48 bytes, then float32 with channels fastest, then x, y, z."""
+    data = path.read_bytes()
+    if len(data) < 48 or data[:3] != b"VOL" or data[3] != 3:
+        raise InputError("not a Mitsuba .vol file of version 3", file=path, key=key)
+    encoding, nx, ny, nz, channels = struct.unpack_from("<5i", data, 4)
+    corners = np.array(struct.unpack_from("<6f", data, 24), dtype=float)
+    if encoding != 1:
+        raise InputError(f"the .vol file's encoding is {encoding}", file=path, key=key, allowed="1 (float32)")
+    count = nx * ny * nz * channels
+    if min(nx, ny, nz, channels) < 1 or len(data) != 48 + 4 * count:
+        raise InputError(f"the .vol file has {len(data)} bytes, its header says {48 + 4 * count}", file=path, key=key)
+    values = np.frombuffer(data, "<f4", count, 48).reshape(nz, ny, nx, channels)
+    return Voxels(np.moveaxis(values, -1, 0).astype(np.float32), corners[:3], corners[3:])
