@@ -1,0 +1,1 @@
+"""The rig as an interface, the raw record, and real devices."""

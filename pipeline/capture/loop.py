@@ -1,0 +1,197 @@
+"""The capture loop: drives a rig through a plan, image by image, into a stream. Knows the interface, not the rig.
+
+Gates are shut during every move, and one at most is open. The clock is restored on resuming, and with it the state of
+turntable and projector, so that a capture that was interrupted ends with the very bytes of one that was not.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+from hw.errors import DiscoError, InputError
+from hw.interface import Floodlight, Laser, Rig
+from hw.record import RawImage
+from pipeline.capture.layout import ImageMeta
+from pipeline.capture.plan import ImageAddress, Plan
+from pipeline.capture.stream import StreamReader, StreamWriter
+
+log = logging.getLogger(__name__)
+
+Progress = Callable[[int, int], None]  # images stored, images of the plan
+
+
+class Interrupted(DiscoError):
+    """The user asked to stop; every image that was reported as stored is."""
+
+
+@dataclass(frozen=True)
+class CaptureReport:
+    """What is in the folder now. `resumed_at`: images that were there before; bytes of images.bin and uncompressed."""
+
+    images: int
+    resumed_at: int
+    views: int
+    spots: int
+    lasers: int
+    bytes_raw: int
+    bytes_stored: int
+
+
+def capture(rig: Rig, plan: Plan, folder: Path, progress: Progress | None = None) -> CaptureReport:
+    """Take the images of the plan that are not yet stored in the folder. The rig is safe whenever this ends.
+
+    Ctrl-C (or SIGTERM, SIGHUP) lets the image in progress finish, then raises `Interrupted`; a second one does not
+    wait. The folder of another plan is refused before the rig is switched on.
+    """
+    _require_match(rig, plan)
+    with StreamWriter(folder, plan) as stream:
+        resumed_at = len(stream)
+        if not stream.complete:
+            log.info("capture: image %d of %d into %s", resumed_at, len(plan), folder)
+            with _Signals() as signals:
+                try:
+                    with rig:
+                        _sweep(rig, stream, signals, progress)
+                except KeyboardInterrupt:
+                    raise _interrupted(stream) from None
+                finally:
+                    signals.ignore()
+                    rig.make_safe()  # once more: entering the rig may have failed half-way, leaving it been interrupted
+    with StreamReader(folder) as stored:
+        raw, size = stored.bytes_raw(), stored.bytes_stored
+    return CaptureReport(len(plan), resumed_at, plan.views, len(plan.spots), plan.lasers, raw, size)
+
+
+def _require_match(rig: Rig, plan: Plan) -> None:
+    names = tuple(camera.name for camera in rig.cameras)
+    if names != plan.cameras:
+        raise InputError("the plan is for other cameras", key="cameras", value=names, allowed=str(plan.cameras))
+    if len(rig.lasers) != plan.lasers:
+        raise InputError("the plan is for other lasers", key="lasers", value=len(rig.lasers), allowed=str(plan.lasers))
+
+
+def _sweep(rig: Rig, stream: StreamWriter, signals: _Signals, progress: Progress | None) -> None:
+    plan = stream.plan
+    announced = None
+    _restore(rig, stream)
+    for index in range(len(stream), len(plan)):
+        address = plan.address(index)
+        with signals.held():
+            if address.kind == "silhouette":
+                rig.turntable.move(plan.angles_rad[plan.angle_of(address.view)])
+        if address.kind == "spot" and announced != address.view:
+            # A simulated rig may compute for minutes here: not held, so that Ctrl-C is obeyed at once.
+            rig.announce([plan.spots[i] for i in plan.spots_at(plan.angle_of(address.view))])
+            announced = address.view
+        with signals.held():
+            stream.append(address, *_take(rig, plan, address))
+        if progress is not None:
+            progress(index + 1, len(plan))
+
+
+def _restore(rig: Rig, stream: StreamWriter) -> None:
+    """Bring rig and clock to where they were when the last stored image was complete."""
+    meta = stream.last_meta()
+    if meta is None:
+        return
+    rig.turntable.move(meta.angle_rad)
+    # After a silhouette the mirrors still stand where the last spot of the view before it left them.
+    backwards = (stream.plan.address(i).spot for i in range(len(stream) - 1, -1, -1))
+    spot = next((spot for spot in backwards if spot >= 0), None)
+    if spot is not None:
+        rig.projector.move(stream.plan.spots[spot].u, stream.plan.spots[spot].v)
+    rig.resume_at(meta.time_s)
+
+
+def _take(rig: Rig, plan: Plan, address: ImageAddress) -> tuple[RawImage, ImageMeta]:
+    """One image and the rig's state; the time is read last, when nothing of this image remains to be done."""
+    camera = rig.cameras[plan.camera_of(address.view)]
+    angle = plan.angles_rad[plan.angle_of(address.view)]
+    if address.kind == "silhouette":
+        with _lit(rig.floodlight):
+            raw = camera.expose()
+        return raw, ImageMeta(rig.now(), 0.0, angle, -1, -1)
+    aim = plan.spots[address.spot]
+    if address.laser == 0:
+        rig.projector.move(aim.u, aim.v)
+    with _open(rig.lasers[address.laser]):
+        raw = camera.expose()
+        power = rig.photodiode.read()
+    return raw, ImageMeta(rig.now(), power, angle, aim.u, aim.v)
+
+
+@contextmanager
+def _open(laser: Laser) -> Iterator[None]:
+    """The laser's gate open; shut again whatever happens, even if opening failed half-way."""
+    try:
+        laser.open_gate()
+        yield
+    finally:
+        laser.close_gate()
+
+
+@contextmanager
+def _lit(floodlight: Floodlight) -> Iterator[None]:
+    try:
+        floodlight.on()
+        yield
+    finally:
+        floodlight.off()
+
+
+def _interrupted(stream: StreamWriter) -> Interrupted:
+    done, total = len(stream), len(stream.plan)
+    return Interrupted(f"stopped: {done} of {total} images are stored; the same command continues")
+
+
+class _Signals:
+    """Turns SIGINT, SIGTERM and SIGHUP into KeyboardInterrupt, but not in the middle of an image.
+
+    Within `held` the first signal waits for the end of the block, the second one does not. A signal that is ignored
+    already (nohup) stays so. Outside the main thread Python delivers no signals, and this does nothing.
+    """
+
+    def __init__(self) -> None:
+        self._before: dict[signal.Signals, signal._HANDLER] = {}
+        self._holding = self._asked = self._ignoring = False
+
+    def __enter__(self) -> _Signals:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                if signal.getsignal(number) not in (signal.SIG_IGN, None):
+                    self._before[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self._ignoring:
+            return
+        if self._asked or not self._holding:
+            raise KeyboardInterrupt
+        self._asked = True
+        log.info("stopping after this image")
+
+    def ignore(self) -> None:
+        """From here on nothing interrupts: the rig is being made safe."""
+        self._ignoring = True
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """A block that the first signal does not interrupt."""
+        self._holding = True
+        try:
+            yield
+        finally:
+            self._holding = False
+        if self._asked:
+            raise KeyboardInterrupt
