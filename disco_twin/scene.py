@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from disco_twin.object.schema import ObjectConfig
 from pipeline.config import Strict, load_toml
 from pipeline.reconstruct.settings import ReconstructConfig
-from pipeline.relight.lights import Colour, Light
+from pipeline.relight.lights import Colour, Light, shipped_lights
 from pipeline.rig import CameraConfig, RigConfig
 
 Count = Annotated[int, Field(ge=1, le=10**10)]
@@ -33,10 +33,24 @@ class SimulationConfig(Strict):
 
 
 class RelightConfig(Strict):
-    """What the model is tried on: lights, and held-out cameras in the object frame."""
+    """What the model is tried on: held-out cameras in the object frame, and lights.
 
-    lights: tuple[Light, ...] = ()
+    A light is a table or the name of a shipped one (those are placed by the first view); left out: all shipped ones.
+    """
+
     views: Annotated[tuple[CameraConfig, ...], Field(min_length=2, max_length=16)]
+    lights: Annotated[tuple[Light, ...], Field(validate_default=True)] = ()
+
+    @field_validator("lights", mode="before")
+    @classmethod
+    def _by_name(cls, lights: Any, info: ValidationInfo) -> Any:
+        if "views" not in info.data or not isinstance(lights, list | tuple):
+            return lights  # reported as such
+        shipped = {light.name: light for light in shipped_lights(info.data["views"][0].position_mm)}
+        unknown = [light for light in lights if isinstance(light, str) and light not in shipped]
+        if unknown:
+            raise ValueError(f"unknown light {unknown[0]!r}, shipped are {', '.join(shipped)}")
+        return [shipped[light] if isinstance(light, str) else light for light in lights or shipped]
 
 
 class Scene(Strict):

@@ -41,7 +41,8 @@ def _sheet(distance: F64, width: float, cell: float) -> F64:
 
 
 def _unit(vector: ArrayLike) -> F64:
-    return np.asarray(vector, float) / np.linalg.norm(np.asarray(vector, float))
+    values = np.asarray(vector, dtype=np.float64)
+    return np.asarray(values / np.linalg.norm(values))
 
 
 def _foam(feature: Veins, points: F64, mesh: trimesh.Trimesh) -> F64:

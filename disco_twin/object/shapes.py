@@ -20,9 +20,9 @@ def pebble(config: Pebble) -> trimesh.Trimesh:
     d = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
     bumps = random.normal(size=(9, 3))
     radius = np.ones(len(d))
-    for centre, height in zip(bumps, random.uniform(0.06, 0.16, len(bumps)), strict=True):
+    for centre, height in zip(bumps, random.uniform(0.08, 0.18, len(bumps)), strict=True):
         radius += height * _lobe(d, centre, 10.0)
-    for centre, depth in zip(DENTS, (0.34, 0.26), strict=True):
+    for centre, depth in zip(DENTS, (0.45, 0.36), strict=True):
         radius -= depth * _lobe(d, centre, 7.0)
     points = d * radius[:, None]
     low, high = points.min(axis=0), points.max(axis=0)
