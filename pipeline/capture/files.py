@@ -129,5 +129,5 @@ def replace_file(path: Path, data: bytes) -> None:
 
 def storage_error(folder: Path, stored: int, error: OSError) -> StorageError:
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    reason = "the disk is full" if full else (error.strerror or str(error))
-    return StorageError(f"{folder}: {reason}; {stored} images are stored. Remedy: make room, repeat the same command")
+    reason, remedy = ("the disk is full", "make room") if full else (error.strerror or str(error), "check the disk")
+    return StorageError(f"{folder}: {reason}; {stored} images are stored. Remedy: {remedy}, repeat the same command")
