@@ -19,7 +19,7 @@ def transmittance(cosine: ArrayLike, eta: float) -> NDArray[np.float64]:
     if eta < 1:
         raise ValueError(f"relative index {eta} < 1: the light comes from the thinner side")
     outside = np.clip(np.asarray(cosine, np.float64), 0.0, 1.0)
-    inside = np.sqrt(1.0 - (1.0 - outside**2) / eta**2)
+    inside = np.sqrt((eta**2 - 1.0) + outside**2) / eta
     # T = 1 - R written without the subtraction, which would lose all digits near grazing incidence.
     with np.errstate(invalid="ignore"):
         s = 4 * eta * outside * inside / (outside + eta * inside) ** 2

@@ -15,9 +15,8 @@ from pipeline.relight.lights import Beam, Directional, Environment, Light, Textu
 
 F64 = NDArray[np.float64]
 
-# Generalised golden ratios (Roberts 2018, R2 sequence): shifts of one point's directions against another's.
-_SHIFT = np.array([0.7548776662466927, 0.5698402909980532])
-_GOLDEN = 0.6180339887498949
+_GOLDEN = 0.6180339887498949  # turns from one direction to the next: a Fibonacci lattice
+_SHIFT = 0.7548776662466927  # turns from one point's lattice to the next point's, so that their errors average out
 
 
 def colour(light: Uniform | Directional | Beam | TexturedProjector, lasers: int) -> F64:
@@ -45,10 +44,8 @@ def from_one_direction(light: Directional | Beam | TexturedProjector, points: F6
     along = _unit(light.direction)
     towards = np.broadcast_to(-along, points.shape)
     if isinstance(light, Beam):
-        offset = points - np.array(light.through_mm)
-        from_axis = np.linalg.norm(offset - np.outer(offset @ along, along), axis=1)
         radius = light.diameter_mm / 2
-        return towards, np.where(from_axis <= radius, light.power_w / (np.pi * radius**2), 0.0)
+        return towards, np.where(_from_axis(light, points) <= radius, light.power_w / (np.pi * radius**2), 0.0)
     across = np.full(len(points), light.irradiance)
     if light.edge_side is not None:
         across[points @ edge_normal(light) < light.edge_offset_mm] = 0.0
@@ -79,13 +76,18 @@ def _from_projector(light: TexturedProjector, points: F64) -> tuple[F64, F64]:
     return -local @ pose[:3, :3] / np.sqrt(range2)[:, None], light.intensity * slide * falloff / range2
 
 
-def feature_mm(light: Light) -> float | None:
-    """Size of the light's own finest structure that a first sampling must not miss; None if it has none."""
-    if isinstance(light, Beam):
-        return light.diameter_mm
+def finest_mm(light: Light, centres: F64, radii: F64) -> F64:
+    """(N,) size of the light's own finest structure inside balls (N, 3), (N,) in mm; infinite where it has none."""
     if isinstance(light, TexturedProjector):
-        return min(light.period_mm / 2, light.half_width_mm)
-    return None
+        return np.full(len(centres), min(light.period_mm / 2, light.half_width_mm))
+    if isinstance(light, Beam):
+        from_axis = _from_axis(light, centres)
+        return np.where(from_axis <= light.diameter_mm / 2 + radii, light.diameter_mm, np.inf)
+    return np.full(len(centres), np.inf)
+
+
+def _from_axis(light: Beam, points: F64) -> F64:
+    return np.asarray(np.linalg.norm(np.cross(points - np.array(light.through_mm), _unit(light.direction)), axis=1))
 
 
 def from_many_directions(light: Uniform | Environment, normals: F64, count: int, lasers: int) -> list[tuple[F64, F64]]:
@@ -97,8 +99,8 @@ def from_many_directions(light: Uniform | Environment, normals: F64, count: int,
     if isinstance(light, Uniform):
         light = Environment(constant=tuple(light.radiance * x for x in light.colour), name=light.name)
     index = np.arange(len(normals))[:, None]
-    first = (np.arange(count) + (index * _SHIFT[0]) % 1.0) / count  # (N, count), stratified in 0..1
-    azimuth = 2 * np.pi * ((np.arange(count) * _GOLDEN + index * _SHIFT[1]) % 1.0)
+    first = np.broadcast_to((np.arange(count) + 0.5) / count, (len(normals), count))  # middles of strata
+    azimuth = 2 * np.pi * ((np.arange(count) * _GOLDEN + index * _SHIFT) % 1.0)
     sets = []
     constant = _first(light.constant, lasers, light.name)
     if constant.any():

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse import linalg as sparse_linalg
 
 from pipeline.calibrate.fresnel import transmittance
-from pipeline.relight.arrival import colour, feature_mm, from_many_directions, from_one_direction
+from pipeline.relight.arrival import colour, finest_mm, from_many_directions, from_one_direction
 from pipeline.relight.lights import Environment, Light, Uniform
 from pipeline.relight.surface import F64, Int, Surface
 
@@ -45,8 +45,8 @@ class Accuracy:
     directions: per point, for lights from many directions
     """
 
-    tolerance: float = 1e-3
-    splits: int = 8
+    tolerance: float = 1e-4
+    splits: int = 10
     directions: int = 256
 
 
@@ -88,19 +88,18 @@ def irradiance(light: Light, mesh: trimesh.Trimesh, face: Int, points: F64, lase
     return received(Surface.of(mesh), light, face, points, 1.0, lasers, directions=1024)
 
 
-def _first_cells(surface: Surface, longest: float) -> tuple[Int, F64]:
-    """Cells (C,) faces and (C, 3, 3) corners in barycentric coordinates, no edge longer than `longest` mm."""
-    edges = surface.corners - np.roll(surface.corners, 1, axis=1)
-    length = np.linalg.norm(edges, axis=2).max(axis=1)
-    splits = np.clip(np.ceil(np.log2(length / longest)), 0, 10).astype(int)
+def _first_cells(surface: Surface, light: Light) -> tuple[Int, F64]:
+    """Cells (C,) faces and (C, 3, 3) corners in barycentric coordinates, fine enough that no structure is missed."""
+    longest = surface.size / (12 if isinstance(light, Uniform | Environment) else 40)
+    face, bary = np.arange(len(surface.faces)), np.broadcast_to(np.eye(3), (len(surface.faces), 3, 3))
     faces, corners = [], []
-    for level in np.unique(splits):
-        face = np.flatnonzero(splits == level)
-        bary = np.broadcast_to(np.eye(3), (len(face), 3, 3))
-        for _ in range(level):
-            face, bary = _split(face, bary)
-        faces.append(face)
-        corners.append(bary)
+    while len(face):
+        points = np.einsum("cib,cbx->cix", bary, surface.corners[face])
+        length = np.linalg.norm(points - np.roll(points, 1, axis=1), axis=2).max(axis=1)
+        coarse = length > np.minimum(longest, finest_mm(light, points.mean(axis=1), length) / 4)
+        faces.append(face[~coarse])
+        corners.append(bary[~coarse])
+        face, bary = _split(face[coarse], bary[coarse])
     return np.concatenate(faces), np.concatenate(corners)
 
 
@@ -127,10 +126,7 @@ def hat_moments(
     """(L, V) integrals of hat_u T dA in W; they add up to all the flux that passes the boundary."""
     accuracy = accuracy or Accuracy()
     surface = Surface.of(mesh)
-    many = isinstance(light, Uniform | Environment)
-    longest = surface.size / (12 if many else 40)
-    feature = feature_mm(light)
-    face, bary = _first_cells(surface, longest if feature is None else min(longest, feature / 4))
+    face, bary = _first_cells(surface, light)
     total = np.zeros((lasers, surface.vertices))
 
     def add(owner: Int, part: F64) -> None:
@@ -138,7 +134,7 @@ def hat_moments(
             total[laser] += np.bincount(surface.faces[owner].ravel(), part[laser].ravel(), surface.vertices)
 
     coarse = _moments(surface, light, face, bary, eta, lasers, accuracy.directions)
-    for _ in range(0 if many else accuracy.splits):
+    for _ in range(0 if isinstance(light, Uniform | Environment) else accuracy.splits):
         kids, kid_bary = _split(face, bary)
         fine = _moments(surface, light, kids, kid_bary, eta, lasers, accuracy.directions)
         better = fine.reshape(lasers, len(face), 4, 3).sum(axis=2)

@@ -23,7 +23,7 @@ class RelitScore:
 
     nrmse2:       <(I - A)(I - B)> / <A B>, signed
     nrmse2_se:    its standard error from the reference's noise (the pixels are given, not drawn)
-    nrmse:        sign(nrmse2) sqrt|nrmse2|, with nrmse_se
+    nrmse:        sign(nrmse2) sqrt|nrmse2|, with nrmse_se; tests against zero use nrmse2, whose error is Gaussian
     nrmse_floor:  what noise would have added in quadrature to the nrmse against the mean of A and B
     psnr:         dB, exposed to the 99th percentile, gamma 2.2; None where noise hides the error
     energy_ratio: <I> / <(A + B) / 2>
@@ -75,8 +75,7 @@ def score_relit(image: ArrayLike, half_a: ArrayLike, half_b: ArrayLike, mask: ND
     nrmse2 = float(((i - a) * (i - b)).sum()) / denominator
     noise = _block_sums((i - mean + nrmse2 * mean) * 2 * half, mask)
     nrmse2_se = float(np.sqrt((noise**2).sum())) / denominator
-    # d sqrt(x) = dx / (2 sqrt(x)); within one standard error of zero the root itself is the scale.
-    root_se = min(nrmse2_se / (2 * math.sqrt(abs(nrmse2))) if nrmse2 else math.inf, math.sqrt(nrmse2_se))
+    root_se = 0.5 * (signed_root(nrmse2 + nrmse2_se) - signed_root(nrmse2 - nrmse2_se))  # defined at 0, too
     exposure = float(np.percentile(mean, 99.0))
     psnr = None
     if exposure > 0:

@@ -68,7 +68,7 @@ class Surface:
         return hidden
 
     def first_hit(self, origins: F64, directions: F64) -> tuple[Int, F64]:
-        """Rays (N, 3) mm and unit -> (N,) face first hit or -1, and (N, 3) barycentric coordinates there (0 if none)."""
+        """Rays (N, 3) mm and unit -> (N,) face first hit or -1, (N, 3) barycentric coordinates there (0 if none)."""
         face = np.asarray(self.mesh.ray.intersects_first(origins, directions), np.int64)
         bary = np.zeros((len(face), 3))
         hit = np.flatnonzero(face >= 0)

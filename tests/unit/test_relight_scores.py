@@ -1,0 +1,150 @@
+"""Scores on synthetic images whose error is known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.relight.scores import BLOCK, score_reflectance, score_relit
+
+F64 = NDArray[np.float64]
+SHAPE = (3, 40, 48)
+MASK = np.hypot(*(np.indices(SHAPE[1:]) - np.array([20, 24])[:, None, None])) < 17
+
+
+def reference(rng: np.random.Generator) -> F64:
+    return np.asarray(np.exp(rng.normal(0, 0.5, SHAPE)))
+
+
+def test_without_noise_the_score_is_the_plain_formula() -> None:
+    rng = np.random.default_rng(0)
+    truth = reference(rng)
+    model = truth * 1.1
+    s = score_relit(model, truth, truth, MASK)
+    assert s.nrmse == pytest.approx(0.1, rel=1e-12)
+    assert (s.nrmse_se, s.nrmse_floor) == (0, 0)
+    assert s.energy_ratio == pytest.approx(1.1)
+    assert s.pixels == MASK.sum()
+    exposure = np.percentile(truth[:, MASK], 99)
+    tone = [np.clip(x[:, MASK] / exposure, 0, 1) ** (1 / 2.2) for x in (model, truth)]
+    assert s.psnr == pytest.approx(-10 * np.log10(((tone[0] - tone[1]) ** 2).mean()))
+    dark = score_relit(np.zeros(SHAPE), truth, truth, MASK)
+    assert dark.nrmse == pytest.approx(1)
+    same = score_relit(truth, truth, truth, MASK)
+    assert (same.nrmse, same.psnr) == (0, None)
+
+
+def test_pixels_off_the_object_do_not_matter_and_neither_does_the_unit() -> None:
+    rng = np.random.default_rng(1)
+    truth, noise = reference(rng), rng.normal(0, 0.1, (2, *SHAPE))
+    a, b, model = truth + noise[0], truth + noise[1], truth * 1.2
+    before = score_relit(model, a, b, MASK)
+    after = score_relit(1e-5 * (model + 100 * ~MASK), 1e-5 * (a - 7 * ~MASK), 1e-5 * b, MASK)
+    assert after.nrmse == pytest.approx(before.nrmse, rel=1e-9)
+    assert after.nrmse_se == pytest.approx(before.nrmse_se, rel=1e-9)
+    assert after.psnr == pytest.approx(before.psnr, rel=1e-9)
+
+
+@pytest.mark.parametrize("correlated", [False, True])
+@pytest.mark.parametrize("error", [0.0, 0.03, 0.3])
+def test_unbiased_under_noise_with_an_honest_standard_error(error: float, correlated: bool) -> None:
+    """Rationale: many references of one truth, noise of 30 %, independent or shared by all wavelengths of a block.
+    Expected: nrmse2 scatters about the noiseless value with the standard error it states; the naive score does not.
+    """
+    rng = np.random.default_rng(2)
+    truth = reference(rng)
+    model = truth * (1 + error * rng.normal(0, 1, SHAPE))
+    exact = score_relit(model, truth, truth, MASK).nrmse2
+    z, naive = [], []
+    for _ in range(300):
+        if correlated:
+            coarse = rng.normal(0, 1, (2, 1, SHAPE[1] // BLOCK, SHAPE[2] // BLOCK))
+            noise = np.broadcast_to(coarse.repeat(BLOCK, 2).repeat(BLOCK, 3), (2, *SHAPE))
+        else:
+            noise = rng.normal(0, 1, (2, *SHAPE))
+        a, b = truth * (1 + 0.3 * noise)
+        s = score_relit(model, a, b, MASK)
+        z.append((s.nrmse2 - exact) / s.nrmse2_se)
+        naive.append(((model - (a + b) / 2)[:, MASK] ** 2).sum() / (a * b)[:, MASK].sum())
+        assert naive[-1] == pytest.approx(s.nrmse2 + s.nrmse_floor**2, rel=1e-9)
+    assert abs(np.mean(z)) < 4 * np.std(z) / math.sqrt(len(z))
+    # The chi-squared spread of 300 deviates is 4 %; a dozen blocks' squares widen it for correlated noise.
+    assert np.std(z) == pytest.approx(1, abs=0.45 if correlated else 0.17)
+    if error < 0.1:
+        assert np.mean(naive) > exact + 5 * np.std(naive) / math.sqrt(len(naive))
+
+
+def test_energy_ratio_and_psnr_under_noise() -> None:
+    rng = np.random.default_rng(3)
+    truth = reference(rng)
+    exact = score_relit(truth * 0.9, truth, truth, MASK)
+    noisy = [score_relit(truth * 0.9, *(truth + rng.normal(0, 0.02, (2, *SHAPE))), MASK) for _ in range(20)]
+    assert np.mean([s.energy_ratio for s in noisy]) == pytest.approx(exact.energy_ratio, rel=1e-3)
+    assert np.mean([s.psnr for s in noisy if s.psnr]) == pytest.approx(exact.psnr, abs=0.3)
+
+
+def test_noise_alone_scores_zero_within_its_error_and_may_be_negative() -> None:
+    rng = np.random.default_rng(4)
+    truth = reference(rng)
+    scores = [score_relit(truth, *(truth * (1 + rng.normal(0, 0.5, (2, *SHAPE)))), MASK) for _ in range(100)]
+    assert min(s.nrmse for s in scores) < 0 < max(s.nrmse for s in scores)
+    assert all(math.isfinite(s.nrmse_se) and s.nrmse_se > 0 for s in scores)
+    assert np.mean([abs(s.nrmse2) < 2.5 * s.nrmse2_se for s in scores]) > 0.92
+
+
+def test_refusals() -> None:
+    ones = np.ones(SHAPE)
+    with pytest.raises(ValueError, match="no pixel"):
+        score_relit(ones, ones, ones, np.zeros(SHAPE[1:], bool))
+    with pytest.raises(ValueError, match="no light"):
+        score_relit(ones, ones, 0 * ones, MASK)
+    with pytest.raises(ValueError, match="half"):
+        score_reflectance(ones, ones, ones, True)
+
+
+def impulse(rng: np.random.Generator) -> F64:
+    return np.asarray(10 ** rng.uniform(-4, 0, (3, 40, 200)))
+
+
+def test_reflectance_error_of_a_known_factor_in_every_decade() -> None:
+    truth = impulse(np.random.default_rng(5))
+    scores = score_reflectance(truth * 10**0.2, truth, 0 * truth, True)
+    assert [s.decade for s in scores] == [0, -1, -2, -3]
+    for s in scores:
+        assert s.log10_rmse == pytest.approx(0.2)
+        assert s.coverage == 1
+        assert s.entries == pytest.approx(6000, rel=0.1)
+
+
+def test_reflectance_not_positive_is_one_decade_off_and_uncovered_is_only_counted() -> None:
+    truth = impulse(np.random.default_rng(6))
+    covered = np.arange(200) % 2 == 0
+    scores = score_reflectance(np.where(covered, -1.0, truth), truth, 0 * truth, covered)
+    for s in scores:
+        assert s.log10_rmse == pytest.approx(1)
+        assert s.coverage == pytest.approx(0.5, abs=0.03)
+    assert score_reflectance(truth, truth, 0 * truth, False)[0].log10_rmse is None
+
+
+def test_reflectance_noise_of_the_truth_is_removed() -> None:
+    """Expected: errors of .1 (log10) come out as .1 although the truth itself is known to 5 % only."""
+    rng = np.random.default_rng(7)
+    truth = impulse(rng)
+    estimate = truth * 10 ** (0.1 * rng.normal(0, 1, truth.shape))
+    scores = score_reflectance(estimate, truth * (1 + 0.05 * rng.normal(0, 1, truth.shape)), 0.05 * truth, True)
+    for s in scores:
+        assert s.log10_rmse is not None
+        # The variance of 6000 squares of deviates of .1: .01 sqrt(2/6000) = 1.8e-4, four of them allowed.
+        assert s.log10_rmse**2 == pytest.approx(0.01, abs=8e-4)
+        assert s.floor == pytest.approx(0.05 / math.log(10), rel=0.05)
+
+
+def test_reflectance_entries_that_the_truth_does_not_know_are_left_out() -> None:
+    truth = impulse(np.random.default_rng(8))
+    se = np.where(truth < 0.1, truth, 0.01 * truth)
+    scores = score_reflectance(truth, truth, se, True)
+    assert scores[0].entries > 5000
+    assert sum(s.entries for s in scores[1:]) < 300  # the peak is a little below 1
