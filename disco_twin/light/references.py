@@ -1,0 +1,98 @@
+"""Reference images: the object under other light, traced through the same medium, never through eq. 2.1.
+
+Two independent halves per image let a score remove the reference's noise without bias; light from below the surface
+and light reflected at it are separate layers, since R_d answers for the first alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_twin.light.sources import Source, light_source
+from disco_twin.light.transport import Transport
+from hw.errors import InputError
+from pipeline.calibrate.camera import PinholeCamera
+from pipeline.relight.lights import Light
+
+F32 = NDArray[np.float32]
+
+FORMAT_VERSION = 1
+LAYERS = ("subsurface", "surface")
+HALVES = ("A", "B")
+
+
+@dataclass(frozen=True)
+class Reference:
+    """One light seen by one camera.
+
+    halves: (2, 2, L, H, W) float32 radiance (half, layer, laser, row, column) in W/(mm^2 sr);
+    walks: photons in each half; key: hash of all that the image depends on.
+    """
+
+    halves: F32
+    walks: int
+    key: str
+
+
+def render_reference(
+    transport: Transport, light: Light, cameras: Sequence[PinholeCamera], walks: int, seed: int, key: str = ""
+) -> list[Reference]:
+    """Trace one light towards all cameras at once; `walks` is the number of photons in both halves together."""
+
+    def source(group: Sequence[int]) -> Source:
+        return light_source(light, transport.radius, group)
+
+    half = max(1, walks // 2)
+    traced = transport.trace(source, 2, half, seed=seed, cameras=cameras, layers=2)
+    assert traced.images is not None
+    return [Reference(traced.images[:, :, c], half, key) for c in range(len(cameras))]
+
+
+def save_reference(path: Path, reference: Reference) -> None:
+    """One EXR of half floats, channels `<layer>.<half>.<laser>`, scaled so that the brightest value is 1."""
+    import OpenEXR
+
+    scale = float(reference.halves.max()) or 1.0
+    channels = {
+        f"{layer}.{half}.{laser}": np.ascontiguousarray(reference.halves[h, k, laser] / scale).astype(np.float16)
+        for h, half in enumerate(HALVES)
+        for k, layer in enumerate(LAYERS)
+        for laser in range(reference.halves.shape[2])
+    }
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "formatVersion": FORMAT_VERSION,
+        "radianceScale": scale,
+        "walks": str(reference.walks),
+        "key": reference.key,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    OpenEXR.File(header, channels).write(str(path))
+
+
+def load_reference(path: Path) -> Reference:
+    """Read what `save_reference` wrote."""
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            header, channels = file.header(), {name: c.pixels for name, c in file.channels().items()}
+    except (OSError, RuntimeError) as error:
+        raise InputError(f"not a readable EXR ({error})", file=path, remedy="delete it, it is rendered again") from error
+    if header.get("formatVersion") != FORMAT_VERSION:
+        raise InputError("not a reference of this format", file=path, remedy="delete it, it is rendered again")
+    lasers = len(channels) // (len(HALVES) * len(LAYERS))
+    halves = np.stack(
+        [
+            np.stack([np.stack([channels[f"{layer}.{half}.{k}"] for k in range(lasers)]) for layer in LAYERS])
+            for half in HALVES
+        ]
+    )
+    scale = float(header["radianceScale"])
+    return Reference(halves.astype(np.float32) * scale, int(header["walks"]), str(header["key"]))

@@ -1,0 +1,117 @@
+"""The object's response to laser spots, as the twin's cameras will see it: simulated ahead, kept on disk, reused.
+
+A spot's images depend on (seed, spot) alone, not on what it was simulated together with, so an interrupted capture
+continues with the very same light.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_twin.deviation import ActualRig
+from disco_twin.light.sources import BeamSource, Source
+from disco_twin.light.transport import Transport
+from hw.interface import Aim
+from pipeline.calibrate.camera import PinholeCamera
+from pipeline.rig import RigConfig
+
+log = logging.getLogger(__name__)
+
+F32 = NDArray[np.float32]
+
+CHUNK = 20  # spots simulated together and kept in one file
+FLOODLIGHT = 2e-5  # W/(mm^2 sr) that a white surface shows face on
+
+
+class SpotResponses:
+    """Implements `disco_twin.rig.ResponseSource` by the photon walk.
+
+    Each chunk of spots is one file `spots-<name>.npy` in `scratch`, (2, spots, C, L, H, W) float32: mean radiance per
+    watt, and the simulation's own variance of it.
+    """
+
+    def __init__(
+        self, transport: Transport, config: RigConfig, actual: ActualRig, walks: int, seed: int, scratch: Path
+    ) -> None:
+        self.transport, self.config, self.actual = transport, config, actual
+        self.walks, self.seed, self.scratch = walks, seed, scratch
+        self.views = [
+            [actual.camera(c, j) for c in range(len(config.cameras))] for j in range(len(config.turntable_angles_deg))
+        ]
+        self._chunk_of: dict[Aim, tuple[Aim, ...]] = {}
+        self._loaded: tuple[tuple[Aim, ...], F32] | None = None
+        scratch.mkdir(parents=True, exist_ok=True)
+
+    def prepare(self, aims: Sequence[Aim]) -> None:
+        """Note which spots come next; they are simulated in chunks when the first of a chunk is asked for."""
+        for angle in sorted({aim.angle for aim in aims}):
+            ahead = [aim for aim in dict.fromkeys(aims) if aim.angle == angle and aim not in self._chunk_of]
+            for low in range(0, len(ahead), CHUNK):
+                chunk = tuple(ahead[low : low + CHUNK])
+                self._chunk_of.update(dict.fromkeys(chunk, chunk))
+
+    def image(self, camera: int, aim: Aim, laser: int) -> F32:
+        """(H, W) radiance per watt in W/(mm^2 sr)."""
+        return self._spot(aim)[0, camera, laser]
+
+    def variance(self, camera: int, aim: Aim, laser: int) -> F32:
+        """(H, W) variance of `image` by the simulation's own noise."""
+        return self._spot(aim)[1, camera, laser]
+
+    def _spot(self, aim: Aim) -> F32:
+        if aim not in self._chunk_of:
+            self.prepare([aim])
+        chunk = self._chunk_of[aim]
+        if self._loaded is None or self._loaded[0] != chunk:
+            self._loaded = (chunk, self._load(chunk))
+        return np.asarray(self._loaded[1][:, chunk.index(aim)])
+
+    def _load(self, chunk: tuple[Aim, ...]) -> F32:
+        name = hashlib.sha256(repr((chunk, self.walks, self.seed)).encode()).hexdigest()[:16]
+        path = self.scratch / f"spots-{name}.npy"
+        if not path.exists():
+            partial = path.with_suffix(".part")
+            with partial.open("wb") as file:
+                np.save(file, self._simulate(chunk))
+            os.replace(partial, path)
+        return np.asarray(np.load(path, mmap_mode="r"))
+
+    def _simulate(self, chunk: tuple[Aim, ...]) -> F32:
+        origins, directions = self.actual.spot_rays(chunk)
+        beam = self.config.projector
+        names = np.array([zlib.crc32(repr(aim).encode()) for aim in chunk], np.uint32)
+
+        def source(group: Sequence[int]) -> Source:
+            power = np.ones((len(chunk), len(group)))
+            return BeamSource(origins, directions, beam.beam_diameter_mm / 2, power, beam.beam_profile)
+
+        cameras = self.views[chunk[0].angle]
+        traced = self.transport.trace(
+            source, len(chunk), self.walks, seed=self.seed, streams=names, cameras=cameras
+        )
+        assert traced.images is not None and traced.variance is not None
+        return np.stack([traced.images[:, 0], traced.variance[:, 0]])
+
+    def silhouette(self, camera: int, angle: int) -> F32:
+        """(H, W) radiance of the object, dusted white, under floodlights around the camera; the background is dark."""
+        return floodlit(self.transport.scene, self.views[angle][camera])
+
+
+def floodlit(scene: mi.Scene, camera: PinholeCamera, supersample: int = 4) -> F32:
+    """(H, W) radiance of a Lambertian object lit from the camera's direction and, more weakly, from all around."""
+    origins, directions = camera.rays(camera.pixel_centres(supersample))
+    ray = mi.Ray3f(mi.Point3f(origins.T.astype(np.float32)), mi.Vector3f(directions.T.astype(np.float32)))
+    hit = scene.ray_intersect(ray, mi.RayFlags.Minimal, True, True)
+    cosine = np.abs((np.array(hit.n).T * directions).sum(axis=1))
+    shade = np.where(np.array(hit.is_valid()), 0.3 + 0.7 * cosine, 0.0) * FLOODLIGHT
+    fine = shade.reshape(camera.height, supersample, camera.width, supersample)
+    return fine.mean(axis=(1, 3)).astype(np.float32)

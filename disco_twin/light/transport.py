@@ -1,0 +1,313 @@
+"""Light transport through one object: sets up the photon walk and turns its integer counts into images and deposits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_twin.light import walk as kernel
+from disco_twin.light.distance import build_distance_field
+from disco_twin.light.sources import Source, opaque3, to_float, weight_type
+from disco_twin.object.build import Medium, TwinObject
+from pipeline.calibrate.camera import PinholeCamera
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+
+LANES = 1 << 15
+PHOTONS_PER_CALL = 1 << 22
+ACCUMULATOR_BYTES = 256 << 20
+
+
+@dataclass(frozen=True)
+class Lobe:
+    """The lobe connection: its concentration, the depth from which it starts and its longest flight, both in mm."""
+
+    kappa: float
+    reach: float
+    length: float
+
+    @classmethod
+    def of(cls, medium: Medium) -> Lobe:
+        """Three and twelve mean free paths, the best of what docs/decisions/0010 measured."""
+        free_path = 1.0 / max(float(medium.sigma_t.mean()), 1e-9)
+        return cls(100.0, 3.0 * free_path, 12.0 * free_path)
+
+
+@dataclass(frozen=True)
+class EnergyBalance:
+    """Mean fractions of the launched power per wavelength (L,), and their sum's departure from one.
+
+    launched + roulette = reflected + escaped + absorbed + boundary + inside, up to rounding.
+    """
+
+    launched: F64
+    reflected: F64
+    escaped: F64
+    absorbed: F64
+    boundary: F64
+    roulette: F64
+    inside: F64
+
+    @property
+    def residual(self) -> F64:
+        """What the terms leave unexplained, as a share of the launched power; rounding only."""
+        out = self.reflected + self.escaped + self.absorbed + self.boundary + self.inside
+        return np.asarray((self.launched + self.roulette - out) / self.launched)
+
+
+@dataclass(frozen=True)
+class Traced:
+    """What a trace measured, per watt of the source's own power scale.
+
+    images, variance: (T, layers, C, L, H, W) float32 radiance [1/(mm^2 sr) per W launched] and the variance of its mean
+    deposits: (T, L, V) float64 power that left at each vertex's hat function; either is None if not asked for
+    """
+
+    images: F32 | None
+    variance: F32 | None
+    deposits: F64 | None
+    balance: EnergyBalance
+
+
+class Transport:
+    """The object as the walk sees it: Mitsuba scene, distance field, medium tables, one group of wavelengths a walk.
+
+    Wavelengths with the same sigma_t and g share one walk; the others get walks of their own (`groups`).
+    """
+
+    def __init__(self, obj: TwinObject, cells: int = 128, lobe: Lobe | None = None) -> None:
+        self.object = obj
+        self.lobe = lobe or Lobe.of(obj.medium)
+        self.vertices = np.asarray(obj.mesh.vertices, np.float64)
+        self.faces = np.asarray(obj.mesh.faces, np.int64)
+        self.radius = float(np.linalg.norm(self.vertices, axis=1).max()) * 1.001
+        self.lasers = len(obj.medium.sigma_t)
+        self.groups = wavelength_groups(obj.medium)
+        boundary = {
+            "rough": {
+                "type": "roughdielectric", "int_ior": obj.boundary.eta, "ext_ior": 1.0,
+                "alpha": obj.boundary.alpha, "distribution": "ggx",
+            },
+            "smooth": {"type": "dielectric", "int_ior": obj.boundary.eta, "ext_ior": 1.0},
+            "matched": {"type": "null"},
+        }[obj.boundary.kind]  # fmt: skip
+        self.scene = mesh_scene(self.vertices, self.faces, boundary)
+        self._cells = cells
+
+    @cached_property
+    def _shared(self) -> dict[str, object]:
+        """Tables that do not depend on the wavelength."""
+        field = build_distance_field(self.object.mesh, self._cells)
+        return dict(
+            scene=self.scene,
+            bsdf=self.scene.shapes()[0].bsdf(),
+            matched=self.object.boundary.kind == "matched",
+            eta=self.object.boundary.eta,
+            distance=to_float(field.distance),
+            normal=to_float(field.normal),
+            cells=field.cells,
+            low=opaque3(mi.Point3f, field.low),
+            inverse_cell=dr.opaque(mi.Float, 1 / field.cell),
+            bound=dr.opaque(mi.Float, 1.01 * float(np.abs(self.vertices).max()) + 1e-3),
+            faces=mi.UInt32(self.faces.astype(np.uint32).ravel()),
+            vertices=to_float(self.vertices),
+            vertex_count=len(self.vertices),
+            # Some 40 units in the last place of the largest coordinate: far below a free path, above rounding.
+            kappa=dr.opaque(mi.Float, self.lobe.kappa),
+            reach=dr.opaque(mi.Float, self.lobe.reach),
+            length=dr.opaque(mi.Float, self.lobe.length),
+            lift=dr.opaque(mi.Float, 4e-6 * (1.0 + float(np.abs(self.vertices).max()))),
+        )
+
+    def _tables(self, group: Sequence[int]) -> kernel.Tables:
+        medium = self.object.medium
+        sigma_t = medium.sigma_t[group[0]].astype(np.float64)
+        albedo = medium.albedo[list(group)].astype(np.float64)
+        majorant = max(float(sigma_t.max()), 1e-9)
+        homogeneous = bool(np.ptp(sigma_t) == 0 and np.all(np.ptp(albedo.reshape(len(group), -1), axis=1) == 0))
+        channels = {1: 2, 2: 4, 3: 4}[len(group)]
+        packed = np.zeros((*sigma_t.shape, channels), np.float32)
+        packed[..., 0] = sigma_t / majorant
+        packed[..., 1 : 1 + len(group)] = np.moveaxis(albedo, 0, -1)
+        size = np.asarray(medium.high) - np.asarray(medium.low)
+        nz, ny, nx = sigma_t.shape
+        g = float(medium.g[group[0]])
+        return kernel.Tables(
+            **self._shared,
+            lasers=len(group),
+            homogeneous=homogeneous and sigma_t.max() > 0,
+            isotropic=g == 0.0,
+            g=dr.opaque(mi.Float, g),
+            majorant=dr.opaque(mi.Float, majorant),
+            medium=to_float(packed),
+            albedo=weight_type(len(group))(*[dr.opaque(mi.Float, float(a.flat[0])) for a in albedo]),
+            dims=mi.ScalarPoint3i(nx, ny, nz),
+            medium_low=opaque3(mi.Point3f, medium.low),
+            medium_scale=opaque3(mi.Vector3f, np.array([nx, ny, nz]) / size),
+        )
+
+    def trace(
+        self,
+        make_source: object,
+        tags: int,
+        walks: int,
+        *,
+        seed: int,
+        streams: NDArray[np.uint32] | None = None,
+        cameras: Sequence[PinholeCamera] = (),
+        layers: int = 1,
+        deposit: bool = False,
+        first: int = 0,
+        lanes: int = LANES,
+    ) -> Traced:
+        """Walk `walks` photons (numbers `first`...) of each of `tags` tags.
+
+        make_source: (group of laser indices) -> Source. streams: (T,) names of the tags' random streams, so that a
+        spot gives the same image whatever it is traced together with; 0, 1, 2, ... by default.
+        """
+        streams = np.arange(tags, dtype=np.uint32) if streams is None else streams.astype(np.uint32)
+        parts = [
+            self._trace_group(make_source(group), group, tags, walks, seed, streams, cameras, layers, deposit, first, lanes)
+            for group in self.groups
+        ]
+        order = np.argsort([laser for group in self.groups for laser in group])
+
+        def join(name: str, axis: int) -> NDArray[np.float64] | None:
+            values = [getattr(p, name) for p in parts]
+            if values[0] is None:
+                return None
+            return values[0] if len(values) == 1 else np.take(np.concatenate(values, axis), order, axis)
+
+        balance = EnergyBalance(
+            **{
+                name: np.concatenate([getattr(p.balance, name) for p in parts])[order]
+                for name in EnergyBalance.__dataclass_fields__
+            }
+        )
+        return Traced(join("images", 3), join("variance", 3), join("deposits", 1), balance)
+
+    def _trace_group(
+        self, source: Source, group: Sequence[int], tags: int, walks: int, seed: int, streams: NDArray[np.uint32],
+        cameras: Sequence[PinholeCamera], layers: int, deposit: bool, first: int, lanes: int,
+    ) -> Traced:  # fmt: skip
+        tables = self._tables(group)
+        table = camera_table(cameras) if cameras else None
+        per_tag = 8 * len(group) * (
+            (4 * layers * table.count * table.width * table.height if table else 0)
+            + (len(self.vertices) if deposit else 0)
+        )
+        batch = max(1, min(tags, ACCUMULATOR_BYTES // max(per_tag, 1), (1 << 31) // max(walks, 1)))
+        names = mi.UInt32(streams)
+        total = {name: np.zeros(len(group)) for name in kernel.Balance.__dataclass_fields__}
+        images, variances, deposits = [], [], []
+        for low in range(0, tags, batch):
+            n = min(batch, tags - low)
+            shape = (n, layers, table.count, len(group), table.height, table.width) if table else ()
+            pictures = new_images(cameras, layers, int(np.prod(shape)), source.scale) if table else None
+            powers = new_deposits(n * len(group) * len(self.vertices), walks) if deposit else None
+            step = max(1, min(walks, PHOTONS_PER_CALL // n))
+            for start in range(0, walks, step):
+                m = min(step, walks - start)
+                balance = kernel.walk(
+                    tables, source, table, pictures, powers, dr.opaque(mi.UInt32, n * m), dr.opaque(mi.UInt32, m),
+                    dr.opaque(mi.UInt32, first + start), dr.opaque(mi.UInt32, low), names,
+                    dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), lanes,
+                )  # fmt: skip
+                dr.eval(balance)
+                for name in total:
+                    value = np.array(getattr(balance, name), np.float64).reshape(len(group), -1)
+                    total[name] += value.sum(axis=1)
+            if pictures is not None:
+                mean, variance = read_images(pictures, shape, walks)
+                images.append(mean)
+                variances.append(variance)
+            if powers is not None:
+                counts = np.array(powers.total, np.float64).reshape(n, len(group), -1)
+                deposits.append(counts * (powers.scale / walks))
+        scale = 1.0 / (tags * walks)
+        return Traced(
+            np.concatenate(images) if images else None,
+            np.concatenate(variances) if variances else None,
+            np.concatenate(deposits) if deposits else None,
+            EnergyBalance(**{name: value * scale for name, value in total.items()}),
+        )
+
+
+def wavelength_groups(medium: Medium) -> tuple[tuple[int, ...], ...]:
+    """Laser indices that share sigma_t and g exactly, so that one walk serves them."""
+    groups: list[list[int]] = []
+    for k in range(len(medium.sigma_t)):
+        for group in groups:
+            if medium.g[group[0]] == medium.g[k] and np.array_equal(medium.sigma_t[group[0]], medium.sigma_t[k]):
+                group.append(k)
+                break
+        else:
+            groups.append([k])
+    return tuple(tuple(g) for g in groups)
+
+
+def mesh_scene(vertices: F64, faces: NDArray[np.int64], bsdf: dict[str, object]) -> mi.Scene:
+    """A Mitsuba scene of one mesh with flat (geometric) normals: exact reciprocity, no weight lost to shading."""
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(bsdf)
+    mesh = mi.Mesh("object", len(vertices), len(faces), has_vertex_normals=False, props=properties)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = to_float(vertices)
+    parameters["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+    parameters.update()
+    return mi.load_dict({"type": "scene", "object": mesh})
+
+
+def camera_table(cameras: Sequence[PinholeCamera]) -> kernel.Cameras:
+    """Rows of `kernel.ROW` floats; see `kernel.Cameras`. All cameras must be of one size."""
+    width, height = cameras[0].width, cameras[0].height
+    if any((c.width, c.height) != (width, height) for c in cameras):
+        raise ValueError("cameras traced together must have the same image size")
+    rows = [
+        np.concatenate([c.position, *c.pose[:3, :3], c.focal, c.centre, c.distortion]) for c in cameras
+    ]
+    return kernel.Cameras(count=len(cameras), width=width, height=height, rows=to_float(np.stack(rows)))
+
+
+def new_images(cameras: Sequence[PinholeCamera], layers: int, size: int, weight: float) -> kernel.Images:
+    """Zeroed accumulators. The quantum is 2^-24 of the radiance that a photon of that weight adds at the nearest camera."""
+    unit = weight * max(float(c.focal.prod() / (c.position @ c.position)) for c in cameras)
+    quantum = 2.0 ** (np.floor(np.log2(unit)) - 24)
+    quantum_squared = 2.0 ** (2 * np.floor(np.log2(unit)) - 24)
+    arrays = [dr.zeros(mi.UInt64, size) for _ in range(4)]
+    dr.eval(arrays)
+    images = kernel.Images(
+        layers=layers,
+        exits=arrays[0],
+        exits_squared=arrays[1],
+        lobes=arrays[2],
+        lobes_squared=arrays[3],
+        inverse_quantum=dr.opaque(mi.Float, 1 / quantum),
+        inverse_quantum_squared=dr.opaque(mi.Float, 1 / quantum_squared),
+    )
+    return images
+
+
+def read_images(images: kernel.Images, shape: tuple[int, ...], walks: int) -> tuple[F32, F32]:
+    """Mean and variance of the mean per pixel; splats of one photon into one pixel are taken as independent."""
+    quantum = 1 / float(images.inverse_quantum[0])
+    quantum_squared = 1 / float(images.inverse_quantum_squared[0])
+    size = int(np.prod(shape))
+    mean = (np.array(images.exits) + np.array(images.lobes)).astype(np.float64) * (quantum / walks)
+    square = (np.array(images.exits_squared) + np.array(images.lobes_squared)).astype(np.float64)
+    variance = np.maximum(square * (quantum_squared / walks) - mean**2, 0.0) / walks
+    return mean[:size].reshape(shape).astype(np.float32), variance[:size].reshape(shape).astype(np.float32)
+
+
+def new_deposits(size: int, walks: int) -> kernel.Deposits:
+    """Zeroed accumulators of 2^-24 W a count: 2^40 photons of 1 W fit."""
+    total = dr.zeros(mi.UInt64, size)
+    dr.eval(total)
+    return kernel.Deposits(total=total, inverse_quantum=dr.opaque(mi.Float, 2.0**24), scale=2.0**-24)

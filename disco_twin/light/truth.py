@@ -1,0 +1,96 @@
+"""Ground-truth R_d from photons of its own (design: "What R_d is, exactly"); the pipeline never sees it.
+
+Photons are launched cosine-weighted over the hat function of vertex u, their escaped power is weighted by the hat
+function of vertex v: cosine in, cosine out, which is what is reciprocal.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from disco_twin.light.sources import HatSource
+from disco_twin.light.transport import EnergyBalance, Transport
+from hw.errors import InputError
+from pipeline.calibrate.fresnel import mean_transmittance
+
+F64 = NDArray[np.float64]
+
+REPLICATES = 8
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Columns of R_d on the scan's vertices.
+
+    columns: (n,) vertices; mean, standard_error: (L, n, V) in mm^-2 (index: laser, lit vertex, seen vertex), from
+    `REPLICATES` independent replicates; area: (V,) integral of each hat function in mm^2; balance: where light went.
+    """
+
+    columns: NDArray[np.int64]
+    mean: F64
+    standard_error: F64
+    area: F64
+    balance: EnergyBalance
+
+    def save(self, path: Path) -> None:
+        """Write an .npz, replacing any older one at once."""
+        balance = {f"balance_{k}": getattr(self.balance, k) for k in EnergyBalance.__dataclass_fields__}
+        partial = path.with_suffix(".part")
+        with partial.open("wb") as file:
+            np.savez(
+                file, format_version=FORMAT_VERSION, columns=self.columns, mean=self.mean,
+                standard_error=self.standard_error, area=self.area, **balance,
+            )  # fmt: skip
+        os.replace(partial, path)
+
+    @classmethod
+    def load(cls, path: Path) -> Truth:
+        """Read what `save` wrote; another format version is refused."""
+        with np.load(path, allow_pickle=False) as data:
+            if int(data["format_version"]) != FORMAT_VERSION:
+                raise InputError(
+                    "unknown format", file=path, key="format_version", value=int(data["format_version"]),
+                    allowed=str(FORMAT_VERSION), remedy="run the stage again",
+                )  # fmt: skip
+            balance = EnergyBalance(**{k: data[f"balance_{k}"] for k in EnergyBalance.__dataclass_fields__})
+            return cls(data["columns"], data["mean"], data["standard_error"], data["area"], balance)
+
+
+def hat_areas(transport: Transport, basis: sparse.csr_matrix) -> F64:
+    """(V,) integral over the fine mesh of each scan vertex's hat function, mm^2."""
+    a, b, c = (transport.vertices[transport.faces[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    lumped = np.bincount(transport.faces.ravel(), np.repeat(area / 3, 3), minlength=len(transport.vertices))
+    return np.asarray(basis.T @ lumped)
+
+
+def truth_columns(
+    transport: Transport, basis: sparse.csr_matrix, columns: NDArray[np.int64], walks: int, seed: int
+) -> Truth:
+    """R_d[u, v] = (escaped power weighted by hat v) / (area of v * Tbar^2) per watt that falls on hat u.
+
+    basis: (V_fine, V) the hat functions' values at the vertices of the mesh that light is traced on; walks: a column.
+    """
+    hats = np.repeat(basis[:, columns].toarray().T, REPLICATES, axis=0)
+
+    def source(group: object) -> HatSource:
+        return HatSource(transport.vertices, transport.faces, hats, len(group))  # type: ignore[arg-type]
+
+    names = (np.repeat(columns, REPLICATES) * REPLICATES + np.tile(np.arange(REPLICATES), len(columns))).astype(np.uint32)
+    per_replicate = max(1, round(walks / REPLICATES))
+    traced = transport.trace(source, len(hats), per_replicate, seed=seed, streams=names, deposit=True)
+    assert traced.deposits is not None
+    n, lasers = len(columns), transport.lasers
+    power = np.stack([(basis.T @ deposit.T).T for deposit in traced.deposits])  # (n * replicates, L, V)
+    area = hat_areas(transport, basis)
+    both = mean_transmittance(transport.object.boundary.eta) ** 2
+    reflectance = power.reshape(n, REPLICATES, lasers, -1).transpose(1, 2, 0, 3) / (area * both)
+    error = reflectance.std(axis=0, ddof=1) / np.sqrt(REPLICATES)
+    return Truth(np.asarray(columns), reflectance.mean(axis=0), error, area, traced.balance)
