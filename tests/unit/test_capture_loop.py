@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import random
 import shutil
 import signal
 import threading
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from capture_fakes import FakeRig, contents, small_plan
+from capture_fakes import FakeRig, contents, fork, small_plan
 
 from hw.errors import DiscoError, InputError
 from pipeline.capture.loop import Interrupted, capture
@@ -223,42 +221,46 @@ def test_the_folder_of_another_plan_is_refused_before_the_rig_is_on(tmp_path: Pa
 LONG = small_plan((40, 25, 30))
 
 
-def _killed_after_bytes(folder: Path, report: int, budget: int) -> None:
-    """Child process: captures until the `budget`-th byte is written, which is the last thing it does."""
-    real = os.pwrite
+def _child(folder: Path, report: int, credit: int, budget: int | None) -> None:
+    """Captures, and tells of every stored image; runs at most three images ahead of the one who listens.
+
+    With a budget, the process kills itself in the middle of the write that reaches so many bytes.
+    """
+    real, left = os.pwrite, budget
 
     def pwrite(file: int, data: bytes, offset: int) -> int:
-        nonlocal budget
-        if budget <= len(data):
-            real(file, data[:budget], offset)
+        nonlocal left
+        if left is not None and left <= len(data):
+            real(file, data[:left], offset)
             os.kill(os.getpid(), signal.SIGKILL)
-        budget -= len(data)
+        left = None if left is None else left - len(data)
         return real(file, data, offset)
 
-    os.pwrite = pwrite  # type: ignore[assignment]
-    capture(FakeRig(LONG), LONG, folder, lambda done, _: os.write(report, b"%d\n" % done) and None)
+    def tell(done: int, total: int) -> None:
+        os.write(report, b"%d\n" % done)
+        os.read(credit, 1)
+
+    os.pwrite = pwrite
+    capture(FakeRig(LONG), LONG, folder, tell)
 
 
-def _capture_and_tell(folder: Path, report: int, budget: int) -> None:
-    """Child process: captures and tells of every stored image; the parent kills it when it likes."""
-    capture(FakeRig(LONG), LONG, folder, lambda done, _: os.write(report, b"%d\n" % done) and None)
-
-
-def _run(target: Callable[[Path, int, int], None], folder: Path, budget: int, kill_at: int) -> tuple[int, bool]:
+def _capture_and_kill(folder: Path, budget: int | None, kill_at: int) -> tuple[int, bool]:
     """(last image that the child reported as stored, whether it was killed)."""
-    read, write = os.pipe()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # fork in a process with threads; the child uses none
-        child = multiprocessing.get_context("fork").Process(target=target, args=(folder, write, budget))
-        child.start()
-    os.close(write)
+    read, report = os.pipe()
+    credit, grant = os.pipe()
+    child = fork(_child, folder, report, credit, budget)
+    os.close(report)
+    os.write(grant, b"...")
     last = 0
     with os.fdopen(read) as lines:
         for line in lines:
             last = int(line)
-            if last == kill_at and child.pid is not None:
+            if budget is None and last == kill_at and child.pid is not None:
                 os.kill(child.pid, signal.SIGKILL)
+            os.write(grant, b".")
     child.join(60)
+    os.close(credit)
+    os.close(grant)
     return last, child.exitcode == -signal.SIGKILL
 
 
@@ -275,16 +277,16 @@ def test_sigkill_at_twenty_moments_loses_nothing_that_was_reported(tmp_path: Pat
     size = sum(len(data) for name, data in contents(whole).items() if name != "plan.json")
     kills = stored = 0
     for _ in range(20):
-        target = _killed_after_bytes if how == "at a byte" else _capture_and_tell
-        budget = choose.choice([1, 63, 64, 65, 128, 129, *(choose.randint(1, size // 12) for _ in range(6))])
-        last, killed = _run(target, folder, budget, stored + choose.randint(1, len(LONG) // 22))
+        bytes_left = choose.choice([1, 63, 64, 65, 128, 129, *(choose.randint(1, size // 12) for _ in range(6))])
+        budget = bytes_left if how == "at a byte" else None
+        last, killed = _capture_and_kill(folder, budget, stored + choose.randint(1, len(LONG) // 25))
         kills += killed
         if (folder / "plan.json").exists() and (folder / "journal.bin").exists() and max(last, stored):
             with StreamReader(folder) as stream:
                 assert len(stream) >= max(last, stored)
                 assert stream.verify() == []
                 stored = len(stream)
-    assert kills >= 15
+    assert kills == 20
     assert 0 < stored < len(LONG)
     report = capture(FakeRig(LONG), LONG, folder)
     assert report.resumed_at == stored

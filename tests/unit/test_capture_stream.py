@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import multiprocessing
 import os
 import random
 import shutil
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_fakes import SHAPE, contents, frame, small_plan
+from capture_fakes import SHAPE, contents, fork, frame, small_plan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
@@ -222,6 +221,26 @@ def test_zeros_at_the_end_after_a_power_failure_are_dropped(
     assert contents(tmp_path) == contents(finished)
 
 
+def test_junk_at_the_end_is_cut_off(tmp_path: Path, finished: Path) -> None:
+    shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
+    for name in (files.IMAGES, files.JOURNAL):
+        with (tmp_path / name).open("ab") as file:
+            file.write(b"junk" * 50)
+    assert readable(tmp_path) == list(range(len(PLAN)))
+    write(tmp_path, len(PLAN))
+    assert contents(tmp_path) == contents(finished)
+
+
+def test_an_entry_in_the_wrong_place_is_not_believed(tmp_path: Path, finished: Path) -> None:
+    """A misdirected write: image 7's entry, whole and with a right checksum, stands where image 5's belongs."""
+    shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
+    journal = bytearray((tmp_path / files.JOURNAL).read_bytes())
+    five, seven = (slice(HEADER_BYTES + i * ENTRY_BYTES, HEADER_BYTES + (i + 1) * ENTRY_BYTES) for i in (5, 7))
+    journal[five] = journal[seven]
+    (tmp_path / files.JOURNAL).write_bytes(journal)
+    assert readable(tmp_path) == list(range(len(PLAN)))
+
+
 def test_another_plan_s_folder_is_refused_and_left_alone(tmp_path: Path) -> None:
     write(tmp_path, 9)
     before = contents(tmp_path)
@@ -323,8 +342,7 @@ def test_a_file_size_limit_of_the_system_is_a_full_disk(tmp_path: Path) -> None:
             os._exit(42 if "the disk is full" in str(error) else 1)
         os._exit(2)
 
-    child = multiprocessing.get_context("fork").Process(target=limited)
-    child.start()
+    child = fork(limited)
     child.join(60)
     assert child.exitcode == 42
     whole = readable(tmp_path)
