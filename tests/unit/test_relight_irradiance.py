@@ -274,6 +274,12 @@ def test_direction_sets_integrate_their_radiance() -> None:
     cosine = np.einsum("nkx,nx->nk", constant, normals)
     np.testing.assert_allclose(cosine.mean(axis=1), 2 / 3, atol=3e-4)
     assert cosine.min() > 0
+    for sharpness in (0.5, 3.0, 300.0):  # mean cosine of the von Mises-Fisher distribution
+        lobe = Lobe(direction=(1, 2, 2), sharpness=sharpness, radiance=(1.0,))
+        directions = from_many_directions(Environment(lobes=(lobe,)), normals[:1], 256, 1)[0][0][0]
+        mean = directions.mean(axis=0)
+        expected = (1 / np.tanh(sharpness) - 1 / sharpness) * np.array([1, 2, 2]) / 3
+        np.testing.assert_allclose(mean, expected, atol=5e-3)
 
 
 def test_turning_object_and_light_together_changes_nothing() -> None:
@@ -296,6 +302,10 @@ def test_projection_keeps_the_total_and_a_constant_density() -> None:
     assert q.sum() == pytest.approx(moments.sum(), rel=1e-12)
     surface = Surface.of(mesh)
     np.testing.assert_allclose(np.asarray(surface.mass_matrix().sum(axis=1)).ravel(), surface.vertex_areas())
+    dense = np.zeros((len(mesh.vertices),) * 2)
+    for face, area in zip(mesh.faces, mesh.area_faces, strict=True):
+        dense[np.ix_(face, face)] += area / 12 * (1 + np.eye(3))  # integrals of products of barycentric coordinates
+    np.testing.assert_allclose(q[0], dense.sum(axis=1) * np.linalg.solve(dense, moments[0]), rtol=1e-9, atol=1e-9)
     flat = transmitted_flux(Uniform(), ball(), 1.0, 1)[0]  # density pi everywhere
     np.testing.assert_allclose(flat, np.pi * Surface.of(ball()).vertex_areas(), rtol=1e-10)
 
