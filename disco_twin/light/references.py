@@ -82,7 +82,7 @@ def load_reference(path: Path) -> Reference:
 
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            header, channels = file.header(), {name: c.pixels for name, c in file.channels().items()}
+            header, channels = dict(file.header()), {name: c.pixels for name, c in file.channels().items()}
     except (OSError, RuntimeError) as error:
         raise InputError(f"not a readable EXR ({error})", file=path, remedy="delete it, it is rendered again") from error
     if header.get("formatVersion") != FORMAT_VERSION:

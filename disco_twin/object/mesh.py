@@ -85,7 +85,11 @@ def depth(mesh: trimesh.Trimesh, points: F64) -> F64:
 
 
 def remesh(mesh: trimesh.Trimesh, vertices: int) -> trimesh.Trimesh:
-    """About `vertices` vertices on the surface of `mesh`, triangles of nearly equal area (Botsch and Kobbelt 2004)."""
+    """About `vertices` vertices near the surface of `mesh`, triangles of nearly equal area (Botsch and Kobbelt 2004).
+
+    The result is scaled about its centroid to the area of `mesh`: flat triangles between points of a convex surface
+    lie inside it and would receive too little light.
+    """
     edge = float(np.sqrt(mesh.area / (2 * vertices) * 4 / np.sqrt(3)))
     out = mesh
     for _ in range(6):
@@ -97,7 +101,9 @@ def remesh(mesh: trimesh.Trimesh, vertices: int) -> trimesh.Trimesh:
     if not (out.is_watertight and out.is_winding_consistent and out.volume > 0):
         remedy = "raise scan.vertices, or leave it out to hand over the object's own mesh"
         raise InputError("no closed mesh of so few vertices", key="scan.vertices", value=vertices, remedy=remedy)
-    return out
+    centre = out.centroid
+    scale = np.sqrt(mesh.area / out.area)
+    return trimesh.Trimesh(centre + (out.vertices - centre) * scale, out.faces, process=False)
 
 
 def hat_basis(fine: trimesh.Trimesh, scan: trimesh.Trimesh) -> scipy.sparse.csr_matrix:
