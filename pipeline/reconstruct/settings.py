@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from pipeline.config import Strict
 
+Method = Literal["default", "disco2004", "dipole", "lambertian"]
+Degrees = Annotated[float, Field(gt=0, lt=90)]
+
 
 class ReconstructConfig(Strict):
-    """`eta` is the refractive index that the pipeline assumes; it is never told the scene's."""
+    """What the pipeline assumes and which data it trusts.
+
+    eta: refractive index that is assumed; the pipeline is never told the scene's
+    max_incidence_deg: spots that the laser meets more obliquely are left out
+    max_view_deg: surface that a camera sees more obliquely is left out
+    highlight_deg: a spot's surroundings are not read by a camera within this angle of its mirror direction (measured
+        between half vector and normal); 0 reads everything, right where no light is reflected at the surface
+    """
 
     eta: Annotated[float, Field(ge=1, le=3)] = 1.3
+    max_incidence_deg: Degrees = 65.0
+    max_view_deg: Degrees = 75.0
+    highlight_deg: Annotated[float, Field(ge=0, lt=90)] = 10.0
+    methods: Annotated[tuple[Method, ...], Field(min_length=1)] = ("default", "disco2004", "dipole", "lambertian")

@@ -1,0 +1,114 @@
+"""R_d as a function of distance alone, fitted to the samples: the prior of the completion.
+
+log f(r) is a cubic spline, so f is positive and smooth over many decades. The samples are never put into a logarithm:
+noise makes the faint ones zero or negative. Instead the expectation mu = mean of f over beam and hat function is
+fitted to the values by Gauss-Newton with the variance of the model's own mean (a quasi-likelihood with log link,
+McCullagh & Nelder 1989, ch. 9), which averages noise linearly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+from pipeline.reconstruct.distances import Pairs
+
+F64 = NDArray[np.float64]
+
+NEAR_SCATTER = 0.1  # relative scatter of R_d about a smooth model, near the spot: position, shape, detail
+FAR_SCATTER = 0.3  # and how it grows with log(1 + distance / SCATTER_MM)
+SCATTER_MM = 5.0
+OUTLIER = 3.0  # standard deviations from which on a value counts less (Huber)
+ITERATIONS = 12
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One laser's samples. (S, V) each: values mm^-2 (0 where unobserved), observed, dark variance, noise per signal."""
+
+    value: F64
+    observed: NDArray[np.bool_]
+    dark: F64
+    noise: F64
+
+    def residual(self, expected: F64, distance: F64) -> tuple[F64, F64]:
+        """Relative residual value / expected - 1, clipped to [-1, 2], and its weight (0 where unobserved)."""
+        relative = np.where(self.observed, self.value / expected - 1.0, 0.0)
+        noise = (self.dark + self.noise * expected) / expected**2
+        weight = np.where(self.observed, 1.0 / (noise + scatter(distance) ** 2), 0.0)
+        excess = np.abs(relative) * np.sqrt(weight) / OUTLIER
+        return np.clip(relative, -1.0, 2.0), weight / np.maximum(excess, 1.0)
+
+
+def scatter(distance: F64) -> F64:
+    """Relative scatter of true R_d about a smooth model, by distance in mm."""
+    return np.asarray(NEAR_SCATTER + FAR_SCATTER * np.log1p(distance / SCATTER_MM))
+
+
+@dataclass(frozen=True)
+class Profile:
+    """log f(r) = sum of coefficients times cubic B-splines of r in mm; beyond the last knot it is constant."""
+
+    knots: F64
+    coefficients: F64
+
+    def basis(self, distance: F64) -> F64:
+        """(..., n) values of the B-splines."""
+        inside = np.clip(np.asarray(distance, np.float64), self.knots[0], np.nextafter(self.knots[-1], 0))
+        matrix = BSpline.design_matrix(inside.ravel(), self.knots, 3).toarray()
+        return np.asarray(matrix.reshape(*np.shape(distance), -1))
+
+    def __call__(self, distance: F64) -> F64:
+        """f in mm^-2."""
+        inside = np.clip(np.asarray(distance, np.float64), self.knots[0], np.nextafter(self.knots[-1], 0))
+        return np.asarray(np.exp(BSpline(self.knots, self.coefficients, 3)(inside)))
+
+
+def _knots(edge: float, largest: float) -> F64:
+    """Knots in mm: as dense as the mesh resolves near zero, then in geometric steps."""
+    inner = edge * np.array([0.25, 0.55, 0.9, 1.5, 2.2])
+    outer = np.geomspace(3.0 * edge, max(largest, 4.5 * edge), 8)
+    return np.concatenate([np.zeros(4), inner, outer[:-1], np.repeat(outer[-1], 4)])
+
+
+def _start(profile: Profile, measured: Measured, distance: F64) -> F64:
+    """Coefficients through the logarithms of means over bins of distance."""
+    edges = np.quantile(distance[measured.observed], np.linspace(0, 1, 41))
+    bin_of = np.clip(np.searchsorted(edges, distance) - 1, 0, 39)
+    at, level = [], []
+    for b in range(40):
+        chosen = measured.observed & (bin_of == b)
+        if chosen.any() and measured.value[chosen].mean() > 0:
+            at.append(distance[chosen].mean())
+            level.append(np.log(measured.value[chosen].mean()))
+    basis = profile.basis(np.array(at))
+    bend = np.diff(np.eye(basis.shape[1]), 2, axis=0)
+    return np.asarray(np.linalg.solve(basis.T @ basis + 1e-2 * bend.T @ bend, basis.T @ np.array(level)))
+
+
+def fit_profile(pairs: Pairs, measured: Measured, edge: float, offset: F64 | float = 0.0) -> Profile:
+    """Fit f so that exp(offset) * (mean of f over the pairs' patches) meets the values; offset is (S, V) or 0."""
+    knots = _knots(edge, float(pairs.distance.max()) * 1.01)
+    profile = Profile(knots, np.zeros(len(knots) - 4))
+    profile = Profile(knots, _start(profile, measured, pairs.distance))
+    near_basis, basis = profile.basis(pairs.centres), profile.basis(pairs.distance)
+    bend = np.diff(np.eye(basis.shape[2]), 2, axis=0)
+    stiff = 0.1 * bend.T @ bend
+    for _ in range(ITERATIONS):
+        expected = pairs.mean(profile)
+        jacobian = basis.copy()
+        slope = pairs.histogram @ (profile(pairs.centres)[:, None] * near_basis)
+        jacobian[pairs.first, pairs.second] = slope / expected[pairs.first, pairs.second][:, None]
+        relative, weight = measured.residual(expected * np.exp(offset), pairs.distance)
+        flat, w = jacobian.reshape(-1, basis.shape[2]), weight.ravel()
+        step = np.linalg.solve(
+            (flat * w[:, None]).T @ flat + stiff, flat.T @ (w * relative.ravel()) - stiff @ profile.coefficients
+        )
+        step *= min(1.0, 2.0 / np.abs(step).max())
+        profile = Profile(knots, profile.coefficients + step)
+        if np.abs(step).max() < 1e-3:
+            break
+    return profile

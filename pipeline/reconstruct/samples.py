@@ -1,0 +1,234 @@
+"""From the stream to samples of R_d: all views of one illumination together (thesis 5.3.1).
+
+A pixel that sees the surface under the direction w_o shows L = F_t(w_o) / pi * R_d * F_t(w_i) * Phi (eq. 2.1 for a
+beam of power Phi; no foreshortening cosine, since the whole beam enters). So R_d = pi L / (F_t(w_i) F_t(w_o) Phi).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from hw.record import RadianceImage
+from pipeline.calibrate.calibration import Calibration
+from pipeline.calibrate.fresnel import transmittance
+from pipeline.capture.plan import ImageAddress, Plan
+from pipeline.capture.stream import CorruptImage, StreamReader
+from pipeline.reconstruct.mesh import first_hit, interpolated_normals
+from pipeline.reconstruct.settings import ReconstructConfig
+from pipeline.reconstruct.views import Reading
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+I64 = NDArray[np.int64]
+
+log = logging.getLogger(__name__)
+
+MIN_SHARE = 0.5  # of a vertex's hat that a camera must see
+# Response of [1 -2 1]^T [1 -2 1] / 6 to white noise has the noise's variance, and none to a linear slope (Immerkaer 1996).
+NOISE_MASK = np.outer([1, -2, 1], [1, -2, 1]) / 6.0
+
+
+@dataclass(frozen=True)
+class Spots:
+    """Where the beam's axis meets the scan. All of length S, object frame, mm.
+
+    transmitted: F_t(w_i), 0 for spots that are not used (the beam misses the scan or meets it too obliquely)
+    """
+
+    position: F64  # (S, 3)
+    direction: F64  # (S, 3) unit, of travel
+    normal: F64  # (S, 3) unit
+    triangle: I64  # (S,)
+    barycentric: F64  # (S, 3)
+    transmitted: F64  # (S,)
+    beam_radius: float
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Measured R_d between spots and vertices.
+
+    values: (L, S, V) mm^-2, NaN where not observed; averaged over the hat function of the vertex and over the beam
+    dark_variance, noise_per_signal: (L, S, V); an entry of expectation m has variance dark + per_signal * m
+    """
+
+    mesh: trimesh.Trimesh
+    eta: float
+    spots: Spots
+    values: F32
+    dark_variance: F32
+    noise_per_signal: F32
+
+    @property
+    def variance(self) -> F32:
+        """(L, S, V) variance of the values as measured, mm^-4."""
+        return np.asarray(self.dark_variance + self.noise_per_signal * np.maximum(self.values, 0.0))
+
+
+@dataclass(frozen=True)
+class SampleStatistics:
+    """What was left out, counted. Entries are (laser, spot, vertex); coverage is the share that was observed."""
+
+    images: int
+    corrupt: tuple[str, ...]
+    saturated_pixels: int
+    spots: int
+    spots_too_oblique: int
+    entries_in_highlight: int
+    coverage: float
+
+
+def locate_spots(mesh: trimesh.Trimesh, calibration: Calibration, plan: Plan, settings: ReconstructConfig) -> Spots:
+    """Meet the calibrated beam axes with the scan."""
+    origins, direction = calibration.spot_rays(plan.spots)
+    hit = first_hit(mesh, origins, direction)
+    triangle = np.maximum(hit.triangle, 0)
+    barycentric = np.where(hit.triangle[:, None] >= 0, hit.barycentric, 1.0 / 3.0)
+    normal = interpolated_normals(mesh, triangle, barycentric)
+    cosine = -(normal * direction).sum(axis=1)
+    used = (hit.triangle >= 0) & (cosine > np.cos(np.deg2rad(settings.max_incidence_deg)))
+    position = (mesh.triangles[triangle] * barycentric[:, :, None]).sum(axis=1)
+    transmitted = np.where(used, transmittance(cosine, settings.eta), 0.0)
+    radius = calibration.projectors[0].beam_diameter_mm / 2
+    return Spots(position, direction, normal, triangle, barycentric, transmitted, radius)
+
+
+def noise_squared(image: NDArray[np.floating]) -> F64:
+    """(H, W) local estimate of each pixel's noise variance from its 3 x 3 neighbourhood, exact on average."""
+    return np.asarray(ndimage.convolve(np.asarray(image, np.float64), NOISE_MASK, mode="nearest") ** 2)
+
+
+class _Gathered:
+    """Readings of all spots by all cameras: (L, S, C, V) arrays for one way of reading."""
+
+    def __init__(self, lasers: int, plan: Plan, readings: list[Reading]) -> None:
+        cameras, vertices = len(plan.cameras), readings[0].operator.shape[0]
+        shape = (lasers, len(plan.spots), cameras, vertices)
+        self.readings, self.plan = readings, plan
+        self.squared = [r.operator.multiply(r.operator).tocsr() for r in readings]
+        self.touched = [(r.operator != 0).astype(np.float32).tocsr() for r in readings]
+        self.value = np.full(shape, np.nan, np.float32)
+        self.dark = np.zeros(shape, np.float32)
+        self.noise = np.zeros(shape, np.float32)
+
+    def add(self, address: ImageAddress, image: RadianceImage, noise: F64, scale: float) -> None:
+        view, camera = address.view, self.plan.camera_of(address.view)
+        at = (address.laser, address.spot, camera)
+        reading = self.readings[view]
+        value = reading.operator @ image.radiance.ravel().astype(np.float64) * scale
+        seen = reading.share > MIN_SHARE
+        if image.saturated.any():
+            seen &= self.touched[view] @ image.saturated.ravel().astype(np.float32) == 0
+        self.value[at] = np.where(seen, value, np.nan)
+        self.dark[at] = self.squared[view] @ np.full(noise.size, float(image.variance.min())) * scale**2
+        self.noise[at] = self.squared[view] @ np.maximum(noise.ravel(), image.variance.ravel()) * scale**2
+
+    def noise_per_signal(self) -> F32:
+        """(L, S, C, V) variance per signal; a property of laser, view and vertex, so averaged over a view's spots."""
+        out = np.zeros_like(self.value)
+        for angle in range(len(self.plan.angles_rad)):
+            spots = self.plan.spots_at(angle)
+            part = np.s_[:, spots.start : spots.stop]
+            extra = np.maximum(self.noise[part] - self.dark[part], 0.0)
+            signal = np.where(np.isfinite(self.value[part]), np.maximum(self.value[part], 0.0), 0.0)
+            total = signal.sum(axis=1, keepdims=True)
+            mean = extra.sum(axis=(1, 3), keepdims=True) / np.maximum(signal.sum(axis=(1, 3), keepdims=True), 1e-30)
+            own = extra.sum(axis=1, keepdims=True) / np.maximum(total, 1e-30)
+            out[part] = np.where(total > 0, own, mean)
+        return out
+
+    def combined(self, mesh: trimesh.Trimesh, eta: float, spots: Spots) -> Samples:
+        """One value per laser, spot and vertex: the cameras' mean, by what they see of the footprint and how squarely."""
+        weight = np.zeros(self.value.shape[1:], np.float32)  # (S, C, V)
+        for view, reading in enumerate(self.readings):
+            rows = self.plan.spots_at(self.plan.angle_of(view))
+            weight[rows.start : rows.stop, self.plan.camera_of(view)] = reading.share * reading.cosine
+        weight = np.where(np.isfinite(self.value), weight, 0.0).astype(np.float32)
+        total = weight.sum(axis=2)
+        norm = np.where(total > 0, total, np.nan)
+        value = np.where(weight > 0, weight * self.value, 0.0).sum(axis=2) / norm
+        dark = (weight**2 * self.dark).sum(axis=2) / norm**2
+        slope = (weight**2 * self.noise_per_signal()).sum(axis=2) / norm**2
+        return Samples(mesh, eta, spots, value, dark, slope)
+
+
+def take_samples(
+    stream: StreamReader,
+    calibration: Calibration,
+    mesh: trimesh.Trimesh,
+    readings: Mapping[str, list[Reading]],
+    settings: ReconstructConfig,
+) -> tuple[dict[str, Samples], SampleStatistics]:
+    """Read every spot image once. `readings`: per way of reading, one `Reading` per view; the keys of the result."""
+    plan, lasers = stream.plan, len(calibration.lasers)
+    spots = locate_spots(mesh, calibration, plan, settings)
+    gathered = {name: _Gathered(lasers, plan, views) for name, views in readings.items()}
+    addresses = [a for a in plan.addresses() if a.kind == "spot" and spots.transmitted[a.spot] > 0]
+    corrupt, saturated = [], 0
+    for address, raw in zip(addresses, stream.read_many(addresses), strict=True):
+        if isinstance(raw, CorruptImage):
+            log.warning("%s", raw)
+            corrupt.append(str(address))
+            continue
+        power = stream.meta(address).photodiode_w
+        if not power > 0:
+            log.warning("%s: the photodiode saw no light; image left out", address)
+            corrupt.append(str(address))
+            continue
+        image = calibration.radiance(raw, address.view, address.laser)
+        saturated += int(image.saturated.sum())
+        noise = noise_squared(image.radiance)
+        for g in gathered.values():
+            g.add(address, image, noise, np.pi / (spots.transmitted[address.spot] * power))
+    masked = sum(_mask_highlights(g, spots, calibration, mesh, settings.highlight_deg) for g in gathered.values())
+    samples = {name: g.combined(mesh, settings.eta, spots) for name, g in gathered.items()}
+    first = next(iter(samples.values()))
+    statistics = SampleStatistics(
+        images=len(addresses),
+        corrupt=tuple(corrupt),
+        saturated_pixels=saturated,
+        spots=len(plan.spots),
+        spots_too_oblique=int((spots.transmitted == 0).sum()),
+        entries_in_highlight=masked // max(len(gathered), 1),
+        coverage=float(np.isfinite(first.values).mean()),
+    )
+    return samples, statistics
+
+
+def _mask_highlights(
+    gathered: _Gathered, spots: Spots, calibration: Calibration, mesh: trimesh.Trimesh, limit_deg: float
+) -> int:
+    """Blank what a camera near the beam's mirror direction reads inside the beam; returns the number of entries."""
+    count = 0
+    reach = spots.beam_radius + float(mesh.edges_unique_length.mean())
+    plan = gathered.plan
+    for view in range(plan.views):
+        towards = calibration.view_camera(view).position - spots.position
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        half = towards - spots.direction
+        half /= np.linalg.norm(half, axis=1, keepdims=True)
+        close = (half * spots.normal).sum(axis=1) > np.cos(np.deg2rad(limit_deg))
+        for spot in plan.spots_at(plan.angle_of(view)):
+            if close[spot] and spots.transmitted[spot] > 0:
+                lit = np.linalg.norm(mesh.vertices - spots.position[spot], axis=1) < reach
+                entries = gathered.value[:, spot, plan.camera_of(view)]
+                count += int(np.isfinite(entries[:, lit]).sum())
+                entries[:, lit] = np.nan
+    return count
+
+
+def select_lasers(samples: Samples, lasers: NDArray[np.int64]) -> Samples:
+    """The samples of some of the lasers."""
+    return replace(
+        samples,
+        values=samples.values[lasers],
+        dark_variance=samples.dark_variance[lasers],
+        noise_per_signal=samples.noise_per_signal[lasers],
+    )
