@@ -191,7 +191,7 @@ class ProjectorSource:
         pose = look_at(light.position_mm, light.aim_mm, light.up)
         self.distance = float(np.linalg.norm(np.subtract(light.aim_mm, light.position_mm)))
         centre = pose[:3, 3]  # the object's centre (the origin) in the projector's frame
-        reach = radius * self.distance / max(centre[2] - radius, 1e-3) + float(np.hypot(*centre[:2]))
+        reach = (radius + float(np.hypot(*centre[:2]))) * self.distance / max(centre[2] - radius, 1e-3)
         self.half = min(light.half_width_mm, reach)
         self.rotation = [opaque3(mi.Vector3f, row) for row in pose[:3, :3]]
         self.position = opaque3(mi.Point3f, light.position_mm)

@@ -1,0 +1,7 @@
+"""The validation tests run the renderer: it is chosen once, before anything imports drjit."""
+
+from __future__ import annotations
+
+from disco_twin.backend import activate
+
+activate()
