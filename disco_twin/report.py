@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 F64 = NDArray[np.float64]
 Summary = Mapping[str, Any]
 
+BROAD = ("uniform", "directional", "environment")
+
 STYLE = """
 :root { color-scheme: light; --ink: #22272e; --soft: #5b626c; --line: #e3e6ea; --accent: #1f6391; }
 * { box-sizing: border-box; }
@@ -90,7 +92,8 @@ def render(data: ReportData) -> str:
 def _header(data: ReportData) -> str:
     summary = data.summary
     capture = summary["capture"]
-    broad = [r["nrmse"] for r in summary["relit"] if r["method"] == data.main and r["light"] in ("uniform", "directional", "environment")]
+    own = [r for r in summary["relit"] if r["method"] == data.main]
+    broad = [float(r["nrmse"]) for r in own if r["light"] in BROAD]
     cards = [
         (f"{rms(broad):.3f}" if broad else "-", "nrmse under broad light"),
         (f"{capture['images']:,}", f"images of {capture['spots']} spots in {capture['views']} views"),
@@ -196,7 +199,8 @@ def _costs(data: ReportData) -> str:
     if data.balance:
         parts.append("<h3>Energy balance of the ground truth</h3>")
         parts.append(_image(figures.balance_figure(data.balance, data.wavelengths_nm), "energy balance"))
-    return _section("Time, memory and energy", "Every stage with its own wall-clock time and peak memory.", "".join(parts))
+    text = "Every stage with its own wall-clock time and peak memory."
+    return _section("Time, memory and energy", text, "".join(parts))
 
 
 def _left_out(data: ReportData) -> str:

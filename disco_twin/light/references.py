@@ -9,15 +9,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_twin.light.sources import Source, light_source
-from disco_twin.light.transport import Transport
 from hw.errors import InputError
 from pipeline.calibrate.camera import PinholeCamera
 from pipeline.relight.lights import Light
+
+if TYPE_CHECKING:
+    from disco_twin.light.sources import Source
+    from disco_twin.light.transport import Transport
 
 F32 = NDArray[np.float32]
 
@@ -43,6 +46,8 @@ def render_reference(
     transport: Transport, light: Light, cameras: Sequence[PinholeCamera], walks: int, seed: int, key: str = ""
 ) -> list[Reference]:
     """Trace one light towards all cameras at once; `walks` is the number of photons in both halves together."""
+
+    from disco_twin.light.sources import light_source  # what is stored can be read without a renderer
 
     def source(group: Sequence[int]) -> Source:
         return light_source(light, transport.radius, group)

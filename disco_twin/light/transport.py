@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_twin.light import walk as kernel
+from disco_twin.light.balance import EnergyBalance
 from disco_twin.light.distance import build_distance_field
 from disco_twin.light.sources import Source, opaque3, to_float, weight_type
 from disco_twin.object.build import Medium, TwinObject
@@ -38,28 +39,6 @@ class Lobe:
         """Three and twelve mean free paths, the best of what docs/decisions/0010 measured."""
         free_path = 1.0 / max(float(medium.sigma_t.mean()), 1e-9)
         return cls(100.0, 3.0 * free_path, 12.0 * free_path)
-
-
-@dataclass(frozen=True)
-class EnergyBalance:
-    """Mean fractions of the launched power per wavelength (L,), and their sum's departure from one.
-
-    launched + roulette = reflected + escaped + absorbed + boundary + inside, up to rounding.
-    """
-
-    launched: F64
-    reflected: F64
-    escaped: F64
-    absorbed: F64
-    boundary: F64
-    roulette: F64
-    inside: F64
-
-    @property
-    def residual(self) -> F64:
-        """What the terms leave unexplained, as a share of the launched power; rounding only."""
-        out = self.reflected + self.escaped + self.absorbed + self.boundary + self.inside
-        return np.asarray((self.launched + self.roulette - out) / self.launched)
 
 
 @dataclass(frozen=True)

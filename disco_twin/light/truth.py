@@ -9,15 +9,19 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from disco_twin.light.sources import HatSource
-from disco_twin.light.transport import EnergyBalance, Transport
+from disco_twin.light.balance import EnergyBalance
 from hw.errors import InputError
 from pipeline.calibrate.fresnel import mean_transmittance
+
+if TYPE_CHECKING:
+    from disco_twin.light.sources import HatSource
+    from disco_twin.light.transport import Transport
 
 F64 = NDArray[np.float64]
 
@@ -78,6 +82,8 @@ def truth_columns(
 
     basis: (V_fine, V) the hat functions' values at the vertices of the mesh that light is traced on; walks: a column.
     """
+    from disco_twin.light.sources import HatSource  # what is stored can be read without a renderer
+
     hats = np.repeat(basis[:, columns].toarray().T, REPLICATES, axis=0)
 
     def source(group: object) -> HatSource:

@@ -1,0 +1,150 @@
+"""The twin's stages of a run: scan, capture, ground truth, references. Each writes its files into the run folder."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from disco_twin.folder import RunFolder, write_atomically
+from disco_twin.world import World, reference_key
+from hw.errors import InputError
+from pipeline.calibrate.camera import PinholeCamera
+from pipeline.relight.lights import Light
+from pipeline.rig import CameraConfig
+
+if TYPE_CHECKING:
+    from disco_twin.light.truth import Truth
+    from pipeline.capture.loop import CaptureReport
+
+log = logging.getLogger(__name__)
+
+Progress = Callable[[int, int], None]  # done, total
+COLUMNS_AT_ONCE = 4  # columns of truth between two words on the progress
+
+
+def write_scan(world: World, capture: Path) -> None:
+    """The nominal rig and the scanned mesh: what the pipeline is told beside the images. The loop writes the plan."""
+    _require_equal_sizes(world.scene.rig.cameras, "rig.cameras")
+    world.plan  # noqa: B018 - refuses a rig that cannot capture this object before anything is simulated
+    write_atomically(capture / "scan.ply", bytes(world.scan.export(file_type="ply")))
+    write_atomically(capture / "rig.json", world.scene.rig.model_dump_json(indent=1).encode())
+
+
+def _require_equal_sizes(cameras: Sequence[CameraConfig], key: str) -> None:
+    sizes = {(c.width, c.height) for c in cameras}
+    if len(sizes) > 1:
+        raise InputError("the twin's cameras must have one image size", key=key, value=sorted(sizes))
+
+
+def take_images(world: World, folder: RunFolder, progress: Progress) -> CaptureReport:
+    """The capture by the twin of the rig; continues where it was interrupted."""
+    transport = world.transport
+    from disco_twin.deviation import actual_rig
+    from disco_twin.light.response import SpotResponses
+    from disco_twin.rig import TwinRig
+    from pipeline.capture.loop import capture
+
+    scene = world.scene
+    actual = actual_rig(scene.rig, scene.seed)
+    walks, scratch = scene.simulation.walks_per_spot, folder.twin / "responses"
+    responses = SpotResponses(transport, scene.rig, actual, walks, world.seed("spots"), scratch)
+    return capture(TwinRig(scene.rig, responses, scene.seed, actual), world.plan, folder.capture, progress)
+
+
+def compute_truth(world: World, path: Path, progress: Progress) -> None:
+    """Columns of the true R_d, from photons of their own."""
+    transport = world.transport
+    from disco_twin.light.truth import truth_columns
+    from disco_twin.object.mesh import hat_basis
+
+    basis = hat_basis(world.object.mesh, world.scan)
+    columns = world.truth_columns()
+    parts = []
+    for low in range(0, len(columns), COLUMNS_AT_ONCE):
+        part = columns[low : low + COLUMNS_AT_ONCE]
+        parts.append(truth_columns(transport, basis, part, world.scene.simulation.truth_walks, world.seed("truth")))
+        progress(low + len(part), len(columns))
+    joined(parts).save(path)
+
+
+def joined(parts: Sequence[Truth]) -> Truth:
+    """Truth of several sets of columns as one; the balance is the mean over columns."""
+    from disco_twin.light.balance import EnergyBalance
+    from disco_twin.light.truth import Truth
+
+    weights = [len(p.columns) for p in parts]
+    names = EnergyBalance.__dataclass_fields__
+    mean = {k: np.average([getattr(p.balance, k) for p in parts], axis=0, weights=weights) for k in names}
+    return Truth(
+        np.concatenate([p.columns for p in parts]),
+        np.concatenate([p.mean for p in parts], axis=1),
+        np.concatenate([p.standard_error for p in parts], axis=1),
+        parts[0].area,
+        EnergyBalance(**mean),
+    )
+
+
+def reference_path(folder: Path, light: Light, view: CameraConfig) -> Path:
+    """Where the reference of a light and view lies in a folder of references."""
+    return folder / f"{light.name}@{view.name}.exr"
+
+
+def shipped_references(scene_file: Path, name: str) -> Path:
+    """References that are committed beside a shipped scene."""
+    return scene_file.parent / "references" / name
+
+
+def render_references(world: World, shipped: Path, own: Path, progress: Progress) -> int:
+    """Make sure that every reference lies in `own`: taken from `shipped`, kept from before, or rendered now.
+
+    Returns how many lights had to be rendered.
+    """
+    from disco_twin.light.references import load_reference, save_reference
+
+    scene, rendered = world.scene, 0
+    lights, walks = scene.relight.lights, scene.simulation.reference_walks
+    own.mkdir(parents=True, exist_ok=True)
+
+    def usable(path: Path, key: str) -> bool:
+        if not path.is_file():
+            return False
+        found = load_reference(path)
+        return found.key == key and found.walks >= walks // 2
+
+    for done, light in enumerate(lights):
+        progress(done, len(lights))
+        missing = []
+        for view in scene.relight.views:
+            key, name = reference_key(scene, light, view), reference_path(own, light, view)
+            from_shipped = reference_path(shipped, light, view)
+            if usable(name, key):
+                continue
+            if usable(from_shipped, key):
+                write_atomically(name, from_shipped.read_bytes())
+            else:
+                missing.append(view)
+        for size in sorted({(v.width, v.height) for v in missing}):
+            views = [v for v in missing if (v.width, v.height) == size]
+            _render(world, light, views, own, save_reference)
+        rendered += bool(missing)
+    progress(len(lights), len(lights))
+    return rendered
+
+
+def _render(world: World, light: Light, views: Sequence[CameraConfig], own: Path, save: Callable[..., None]) -> None:
+    from dataclasses import replace
+
+    transport = world.transport
+    from disco_twin.light.references import render_reference
+
+    cameras = [PinholeCamera.from_config(v) for v in views]
+    walks, seed = world.scene.simulation.reference_walks, world.seed(f"reference {light.name}")
+    for view, image in zip(views, render_reference(transport, light, cameras, walks, seed), strict=True):
+        path = reference_path(own, light, view)
+        partial = path.with_name(f"part-{path.name}")
+        save(partial, replace(image, key=reference_key(world.scene, light, view)))
+        partial.replace(path)
