@@ -6,11 +6,15 @@ values compared (Sidak's correction). Seeds are fixed, so a test that passes kee
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 F64 = NDArray[np.float64]
+
+log = logging.getLogger(__name__)
 
 LEVEL = 1e-3
 
@@ -50,11 +54,12 @@ def assert_z(z: ArrayLike, label: str = "", level: float = LEVEL) -> None:
     z = np.atleast_1d(np.asarray(z, float))
     assert np.isfinite(z).all(), f"{label}: z-scores {z}"
     limit = threshold(z.size, level)
+    log.info("%s: %d z-scores, %s", label, z.size, np.round(z.ravel()[:12], 2))
     assert np.abs(z).max() < limit, f"{label}: |z| up to {np.abs(z).max():.2f} of {z.size}, allowed {limit:.2f}; {z}"
 
 
 def chi_squared(counts: ArrayLike, expected: ArrayLike, fitted: int = 1) -> float:
-    """p-value of Pearson's test; cells expected to hold fewer than ten are pooled. `fitted`: constraints in `expected`."""
+    """p-value of Pearson's test; cells expected to hold fewer than ten are pooled. `fitted`: lost degrees of freedom."""
     counts, expected = np.asarray(counts, float).ravel(), np.asarray(expected, float).ravel()
     small = expected < 10
     if small.any():
@@ -77,6 +82,6 @@ def assert_chi_squared(counts: ArrayLike, expected: ArrayLike, label: str = "", 
 def assert_uniform(u: F64, label: str = "", bins: int = 24) -> None:
     """(n, k) points, k = 1..3, fill the unit cube evenly."""
     u = u.reshape(len(u), -1)
-    assert u.min() >= 0 and u.max() <= 1, f"{label}: outside [0, 1]"
+    assert 0 <= u.min() <= u.max() <= 1, f"{label}: outside [0, 1]"
     counts, _ = np.histogramdd(u, bins=[bins] * u.shape[1], range=[(0, 1)] * u.shape[1])
     assert_chi_squared(counts, np.full(counts.shape, len(u) / counts.size), label)

@@ -115,7 +115,8 @@ def test_hat_source_follows_its_hats() -> None:
 def sphere_cells(direction: F64, rings: int = 12, turns: int = 12) -> tuple[NDArray[np.int64], F64, F64]:
     """Cell of each direction on an even grid of (z, azimuth), and quadrature nodes (K, M, 3) with weights (K, M)."""
     z, turn = np.clip(direction[:, 2], -1, 1), np.arctan2(direction[:, 1], direction[:, 0]) / (2 * math.pi) % 1.0
-    cell = np.minimum((z + 1) / 2 * rings, rings - 1).astype(int) * turns + np.minimum(turn * turns, turns - 1).astype(int)
+    ring = np.minimum((z + 1) / 2 * rings, rings - 1).astype(int)
+    cell = ring * turns + np.minimum(turn * turns, turns - 1).astype(int)
     x, w = np.polynomial.legendre.leggauss(24)
     x, w = (x + 1) / 2, w / 2
     nodes, weights = [], []
@@ -226,7 +227,8 @@ def test_projector_is_its_slide_times_cosines() -> None:
     fine = (np.arange(cells * 16) + 0.5) / (cells * 16) * 40 - 20
     aa, bb = np.meshgrid(fine, fine, indexing="ij")
     slide = (1 + 0.7 * np.sin(2 * math.pi * aa / 8) * np.sin(2 * math.pi * bb / 8)) / 1.7
-    density = 3.0 * slide * (distance / np.sqrt(distance**2 + aa**2 + bb**2)) ** 6 / distance**2 * (40 / (cells * 16)) ** 2
+    cosine = distance / np.sqrt(distance**2 + aa**2 + bb**2)
+    density = 3.0 * slide * cosine**6 / distance**2 * (40 / (cells * 16)) ** 2
     expected = density.reshape(cells, 16, cells, 16).sum(axis=(1, 3)).ravel()
     for k, colour in enumerate(light.colour):
         assert_power(weight[:, k], index, expected * colour, f"laser {k}")
