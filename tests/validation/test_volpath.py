@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from disco_twin.light.transport import Transport
 from disco_twin.object.build import Boundary, Medium, TwinObject
 from pipeline.calibrate.camera import PinholeCamera, look_at
 from pipeline.relight.lights import Directional, Uniform
-from tests.validation.significance import assert_agree
+from tests.validation.significance import assert_z, z_of_difference
 
 BLOCK, PIXELS = 4, 24
 DEPTH = 4000
@@ -117,11 +116,13 @@ def test_agrees_with_stock_volpath(boundary: Boundary, heterogeneous: bool, kind
     light = Uniform() if kind == "uniform" else Directional(direction=(-0.7, 0.5, -0.5))
     transport = Transport(obj)
     passes = 16
-    theirs = blocks(volpath_images(obj, camera, light, tmp_path, passes, 64 if kind == "uniform" else 256))
+    theirs = blocks(volpath_images(obj, camera, light, tmp_path, passes, 256 if kind == "uniform" else 384))
     traced = [
-        render_reference(transport, light, [camera], 2 * 60_000, seed)[0].halves.sum(axis=1)[:, 0]
+        render_reference(transport, light, [camera], 2 * 300_000, seed)[0].halves.sum(axis=1)[:, 0]
         for seed in range(passes // 2)
     ]
     ours = blocks(np.concatenate(traced).astype(np.float64))
-    assert_agree(ours, theirs)
-    dr.flush_malloc_cache()
+    seen = (ours > 0).all(axis=0) & (theirs > 0).all(axis=0)  # not the background
+    assert seen.sum() >= 12
+    assert_z(z_of_difference(ours[:, seen], theirs[:, seen]), "blocks")
+    assert_z(z_of_difference(ours.mean(axis=1), theirs.mean(axis=1)), "whole image")
