@@ -120,7 +120,7 @@ def comparison_figure(rows: Sequence[Comparison], shown: Sequence[str]) -> Figur
         bar = figure.colorbar(drawn, ax=line, fraction=0.02, pad=0.01, shrink=0.85)
         bar.set_ticks([-DIFFERENCE_SPAN, 0, DIFFERENCE_SPAN], labels=["-20 %", "0", "+20 %"])
         bar.ax.tick_params(labelsize=7)
-        bar.outline.set_visible(False)  # type: ignore[operator]
+        bar.outline.set_visible(False)
     return figure
 
 
@@ -141,16 +141,17 @@ def impulse_figure(impulses: Sequence[Sequence[Impulse]]) -> Figure:
     rows, columns = len(impulses), len(impulses[0])
     figure, axes = new_figure(2.5 * columns + 0.6, 1.68 * rows + 0.25, nrows=rows, ncols=columns, squeeze=False)
     peak = max(float(i.radiance.max()) for row in impulses for i in row)
-    norm = LogNorm(peak * 1e-6, peak)
+    floor = peak * 1e-6
+    norm = LogNorm(floor, peak)
     for line, row in zip(axes, impulses, strict=True):
         for axis, impulse in zip(line, row, strict=True):
-            drawn = axis.imshow(np.maximum(impulse.radiance, norm.vmin), norm=norm, cmap="magma")
+            drawn = axis.imshow(np.maximum(impulse.radiance, floor), norm=norm, cmap="magma")
             axis.set_title(f"spot {impulse.spot}, {impulse.camera}", loc="left", fontsize=8)
             plain(axis)
         scale_bar(line[0], row[0].mm_per_pixel, row[0].radiance.shape[0])
     bar = figure.colorbar(drawn, ax=axes, fraction=0.02, pad=0.01)
     bar.set_label("radiance per watt, 1/(mm² sr)")
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
     return figure
 
 
