@@ -155,6 +155,12 @@ def impulse_figure(impulses: Sequence[Sequence[Impulse]]) -> Figure:
     return figure
 
 
+def label_log_axis(axis: Any) -> None:
+    """Plain numbers at 1, 2 and 5 of every decade."""
+    axis.set_major_formatter(lambda v, _: f"{v:g}")
+    axis.set_minor_formatter(lambda v, _: f"{v:g}" if f"{v:.0e}"[0] in "25" else "")
+
+
 def light_error_figure(relit: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> Figure:
     """nrmse of every method for every light, both views; log scale."""
     lights = list(dict.fromkeys(str(r["light"]) for r in relit))
@@ -166,7 +172,7 @@ def light_error_figure(relit: Sequence[Mapping[str, Any]], methods: Sequence[str
         error = np.array([float(r["nrmse_se"]) for r in rows])
         axis.errorbar(x, y, xerr=np.minimum(error, 0.95 * x), fmt="o", ms=5, color=colour(method), lw=1, label=method)
     axis.set_xscale("log")
-    axis.xaxis.set_major_formatter(lambda v, _: f"{v:g}")
+    label_log_axis(axis.xaxis)
     axis.set_yticks(range(len(lights)), lights)
     axis.set_ylim(len(lights) - 0.5, -0.5)
     axis.set_xlabel("nrmse against the reference (a point per held-out view, bars: one standard error)")
@@ -184,8 +190,7 @@ def pareto_figure(points: Mapping[str, tuple[float, float]]) -> Figure:
     axis.set_xscale("log")
     axis.set_yscale("log")
     for side in (axis.xaxis, axis.yaxis):
-        side.set_major_formatter(lambda v, _: f"{v:g}")
-    axis.yaxis.set_minor_formatter(lambda v, _: f"{v:g}" if f"{v:.0e}"[0] in "25" else "")
+        label_log_axis(side)
     axis.margins(x=0.25, y=0.2)
     axis.set_xlabel("reconstruction and relighting, s")
     axis.set_ylabel("nrmse, all lights and views (rms)")
@@ -223,19 +228,24 @@ def reflectance_figure(
     return figure
 
 
-def decade_figure(rmse: Mapping[str, Mapping[str, float]], coverage: Mapping[str, float]) -> Figure:
-    """log10 rmse of R_d per decade below the peak for each method, and the share of entries that were measured."""
+def decade_figure(rmse: Mapping[str, Mapping[str, float | None]], coverage: Mapping[str, float | None]) -> Figure:
+    """log10 rmse of R_d per decade below the peak for each method, and the share of entries that were measured.
+
+    A name "method, measured" is drawn in a lighter shade of the method's colour.
+    """
     decades = sorted(coverage, key=float, reverse=True)
-    figure, (left, right) = new_figure(7.2, 2.7, ncols=2, width_ratios=[3, 2])
+    figure, (left, right) = new_figure(9.0, 2.9, ncols=2, width_ratios=[3, 2])
     width = 0.8 / max(len(rmse), 1)
     x = np.arange(len(decades))
     for n, (method, values) in enumerate(rmse.items()):
-        heights = [values.get(d, np.nan) for d in decades]
-        left.bar(x + (n - (len(rmse) - 1) / 2) * width, heights, width * 0.92, color=colour(method), label=method)
+        heights = [np.nan if (v := values.get(d)) is None else max(v, 0.0) for d in decades]
+        ink, shade = colour(method.split(",")[0]), 0.5 if "," in method else 1.0
+        at = x + (n - (len(rmse) - 1) / 2) * width
+        left.bar(at, heights, width * 0.92, color=ink, alpha=shade, label=method)
     left.set_ylabel("log10 rmse of $R_d$")
     left.legend(ncols=2)
     left.margins(y=0.25)
-    right.bar(x, [100 * coverage[d] for d in decades], 0.6, color=FAINT)
+    right.bar(x, [100 * (coverage[d] or 0.0) for d in decades], 0.6, color=FAINT)
     right.set_ylabel("measured entries, %")
     right.set_ylim(0, 100)
     for axis in (left, right):

@@ -1,8 +1,8 @@
 """The run folder: where things lie, whose scene it is, and which stages are finished (so that a run can resume).
 
-    OUT/scene.toml  run.log  stages.json  summary.json  report.html
-    OUT/capture/    all that the pipeline reads        OUT/work/   the pipeline's outputs
-    OUT/twin/       what the pipeline never sees: the simulated responses, true R_d, references
+OUT/scene.toml  run.log  stages.json  summary.json  report.html
+OUT/capture/    all that the pipeline reads        OUT/work/   the pipeline's outputs
+OUT/twin/       what the pipeline never sees: the simulated responses, true R_d, references
 """
 
 from __future__ import annotations

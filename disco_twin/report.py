@@ -57,6 +57,7 @@ class ReportData:
     """What the page shows beyond the summary; what is left empty is left out of the page.
 
     distance: (n, V) mm from the truth columns' vertices; truth: (L, n, V); models: the same by method, mm^-2
+    decades: by method, the log10 rmse of "measured" and of all ("completed") entries and the "coverage" by decade
     seconds: reconstruction and relighting of each method; balance: term -> share of the launched power per wavelength
     """
 
@@ -68,6 +69,7 @@ class ReportData:
     distance: F64 | None = None
     truth: F64 | None = None
     models: Mapping[str, F64] = field(default_factory=dict)
+    decades: Mapping[str, Mapping[str, Mapping[str, float | None]]] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
     balance: Mapping[str, Sequence[float]] = field(default_factory=dict)
     notes: Sequence[str] = ()
@@ -175,21 +177,22 @@ def _errors(data: ReportData) -> str:
 
 
 def _reflectance(data: ReportData) -> str:
-    scores = data.summary["reflectance"]
     parts = []
     if data.truth is not None and data.distance is not None:
         drawn = figures.reflectance_figure(data.distance, data.truth, data.models, data.wavelengths_nm)
         parts.append(_image(drawn, "R_d against distance"))
-    if scores["coverage_by_decade"]:
-        drawn = figures.decade_figure(scores["log10_rmse_by_decade"], scores["coverage_by_decade"])
+    if data.main in data.decades:
+        bars = {f"{data.main}, measured": data.decades[data.main]["measured"]}
+        bars |= {method: scores["completed"] for method, scores in data.decades.items()}
+        drawn = figures.decade_figure(bars, data.decades[data.main]["coverage"])
         parts.append(_image(drawn, "error per decade"))
     if not parts:
         return ""
     return _section(
         "Diffuse subsurface reflectance",
         "R_d between pairs of vertices against the truth that the twin computed with photons of its own: median, and "
-        "the band from the 10th to the 90th percentile. Below: the error of the entries per decade below the peak, "
-        "and the share of them that was measured rather than filled in.",
+        "the band from the 10th to the 90th percentile. Below: the error per decade below the peak, of the entries "
+        "that were measured and of all entries once the model was completed, and the share that was measured.",
         "".join(parts),
     )
 

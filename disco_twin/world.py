@@ -95,9 +95,7 @@ def identity(scene: Scene) -> str:
 def reference_key(scene: Scene, light: Light, view: CameraConfig) -> str:
     """Key of a reference image: object, light and view. More walks make it better, not another one."""
     lasers = len(scene.rig.lasers)
-    return content_key(
-        _plain(scene.object.model_dump()), lasers, _plain(light.model_dump()), _plain(view.model_dump())
-    )
+    return content_key(_plain(scene.object.model_dump()), lasers, _plain(light.model_dump()), _plain(view.model_dump()))
 
 
 def mm_per_pixel(camera: CameraConfig) -> float:

@@ -26,29 +26,60 @@ def fake_data() -> ReportData:
     for light in LIGHTS:
         for view in ("left", "low"):
             reference = (np.stack([shade, 0.8 * shade**1.3, 0.5 * shade**1.6]) * 0.2).astype(np.float32)
-            relit = {m: (reference * (1 + e * random.normal(size=mask.shape))).astype(np.float32) for m, e in METHODS.items()}
+            relit = {
+                m: (reference * (1 + e * random.normal(size=mask.shape))).astype(np.float32) for m, e in METHODS.items()
+            }
             comparisons.append(Comparison(light, view, reference, relit, mask, 0.33, METHODS))
             for method, error in METHODS.items():
                 rows.append(
-                    {"light": light, "view": view, "method": method, "nrmse": error * random.uniform(0.7, 1.4),
-                     "nrmse_se": 0.004, "nrmse_floor": 0.02, "psnr": 31.2, "energy_ratio": 1.01}
-                )  # fmt: skip
+                    {
+                        "light": light,
+                        "view": view,
+                        "method": method,
+                        "nrmse": error * random.uniform(0.7, 1.4),
+                        "nrmse_se": 0.004,
+                        "nrmse_floor": 0.02,
+                        "psnr": 31.2,
+                        "energy_ratio": 1.01,
+                    }
+                )
     distance = random.uniform(0, 50, (8, 300))
     truth = np.exp(-distance / np.array([6.0, 5.0, 4.0])[:, None, None]) * 3e-2 * random.lognormal(0, 0.3, (3, 8, 300))
     decades = ("0", "-1", "-2", "-3")
     impulse = (1e-1 * np.exp(-40 * r2) + 1e-5 * mask).astype(np.float32)
     summary = {
-        "format_version": 1, "scene": "quick <&>", "seed": 1, "method": "default",
-        "stages": [{"name": n, "seconds": s, "peak_mb": 300 + 3 * s} for n, s in
-                   [("scan", 2.0), ("capture", 95.0), ("truth", 40.0), ("references", 0.3), ("pipeline", 30.0), ("scores", 2.0)]],
-        "capture": {"images": 1806, "views": 6, "spots": 300, "wavelengths": 3, "bytes_raw": 129e6, "bytes_stored": 11e6},
+        "format_version": 1,
+        "scene": "quick <&>",
+        "seed": 1,
+        "method": "default",
+        "stages": [
+            {"name": n, "seconds": s, "peak_mb": 300 + 3 * s}
+            for n, s in [
+                ("scan", 2.0),
+                ("capture", 95.0),
+                ("truth", 40.0),
+                ("references", 0.3),
+                ("pipeline", 30.0),
+                ("scores", 2.0),
+            ]
+        ],
+        "capture": {
+            "images": 1806,
+            "views": 6,
+            "spots": 300,
+            "wavelengths": 3,
+            "bytes_raw": 129e6,
+            "bytes_stored": 11e6,
+        },
         "relit": rows,
         "reflectance": {
-            "log10_rmse_by_decade": {m: {d: 0.05 + 0.1 * k for k, d in enumerate(decades)} for m in ("default", "disco2004")},
+            "log10_rmse_by_decade": {d: 0.05 + 0.1 * k for k, d in enumerate(decades)},
             "coverage_by_decade": {d: 0.9 - 0.15 * k for k, d in enumerate(decades)},
         },
-        "left_out": [{"what": "pose search", "because": "the poses are those of the nominal rig, and <deviation> is off"}],
-    }  # fmt: skip
+        "left_out": [
+            {"what": "pose search", "because": "the poses are those of the nominal rig, and <deviation> is off"}
+        ],
+    }
     return ReportData(
         summary=summary,
         wavelengths_nm=(635.0, 532.0, 476.0),
@@ -58,10 +89,23 @@ def fake_data() -> ReportData:
         distance=distance,
         truth=truth,
         models={"default": truth * 1.05, "disco2004": truth * 0.8},
+        decades={
+            m: {
+                "measured": {d: 0.05 + 0.1 * k for k, d in enumerate(decades)},
+                "completed": {d: 0.1 + 0.12 * k if k < 3 else None for k, d in enumerate(decades)},
+                "coverage": {d: 0.9 - 0.15 * k for k, d in enumerate(decades)},
+            }
+            for m in ("default", "disco2004")
+        },
         seconds={"default": 24.0, "disco2004": 21.0, "dipole": 3.0, "lambertian": 1.0},
-        balance={"specular": (0.06,) * 3, "escaped": (0.7, 0.6, 0.5), "absorbed": (0.2, 0.3, 0.4), "boundary loss": (0.04,) * 3},
+        balance={
+            "specular": (0.06,) * 3,
+            "escaped": (0.7, 0.6, 0.5),
+            "absorbed": (0.2, 0.3, 0.4),
+            "boundary loss": (0.04,) * 3,
+        },
         notes=("The rig's deviation is off: poses and projector are the nominal ones.",),
-    )  # fmt: skip
+    )
 
 
 def test_the_page_is_self_contained_and_complete(tmp_path: Path) -> None:

@@ -1,0 +1,137 @@
+"""The command line. Errors that a user can mend are one line on stderr and exit status 2, never a traceback."""
+
+from __future__ import annotations
+
+import errno
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from rich.console import Console
+
+from hw.errors import DiscoError
+from pipeline.capture.loop import Interrupted
+
+app = typer.Typer(
+    help="A digital twin of the DISCO rig: simulate a laser capture, reconstruct R_d, relight, score.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+console = Console()
+
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="The scene's TOML file.")]
+RunOut = Annotated[Path, typer.Option("--out", metavar="DIR", help="The run folder.")]
+ProfileOption = Annotated[
+    Literal["full", "small"], typer.Option(help="`small` shrinks the scene: fewer spots, pixels and walks.")
+]
+MethodsOption = Annotated[
+    str | None, typer.Option(help="`all`, or a list such as default,disco2004; left out: the scene's.")
+]
+
+
+@app.command()
+def run(scene: SceneFile, out: RunOut, profile: ProfileOption = "full", methods: MethodsOption = None) -> None:
+    """Capture, reconstruct, relight and score; writes summary.json and report.html. The same command resumes."""
+    from disco_twin.run import open_run, print_scores, run_all
+
+    opened = open_run(scene, out, profile, methods, console)
+    console.print(f"[bold]{opened.scene.name}[/bold] into {out}", highlight=False)
+    summary = run_all(opened)
+    print_scores(summary, opened.methods, console)
+    console.print(f"\nreport: {opened.folder.report_file.resolve()}", soft_wrap=True, highlight=False)
+
+
+@app.command()
+def capture(scene: SceneFile, out: RunOut, profile: ProfileOption = "full") -> None:
+    """Scan and capture only: DIR/capture is what the pipeline reads."""
+    from disco_twin.console import run_log
+    from disco_twin.run import capture_stages, open_run
+
+    opened = open_run(scene, out, profile, None, console)
+    with run_log(opened.folder.root / "run.log"):
+        capture_stages(opened)
+
+
+@app.command()
+def reconstruct(out: RunOut, methods: MethodsOption = None) -> None:
+    """Reconstruct and relight a capture. Needs no renderer."""
+    from disco_twin.console import run_log
+    from disco_twin.run import pipeline_stage, reopen_run
+
+    opened = reopen_run(out, methods, console)
+    with run_log(opened.folder.root / "run.log"):
+        pipeline_stage(opened)
+
+
+@app.command()
+def reference(scene: SceneFile, out: RunOut, profile: ProfileOption = "full") -> None:
+    """Render the reference images of a scene into DIR, one EXR per light and held-out view."""
+    from disco_twin.console import stage_bar
+    from disco_twin.scene import load_scene
+    from disco_twin.simulate import render_references, shipped_references
+    from disco_twin.world import World
+
+    loaded = load_scene(scene, profile)
+    with stage_bar(console, "references", "lights") as report:
+        lights = render_references(World(loaded), shipped_references(scene, loaded.name), out, report)
+    console.print(f"{lights} lights rendered, {len(loaded.relight.lights) - lights} were there", highlight=False)
+
+
+@app.command()
+def score(out: RunOut, methods: MethodsOption = None) -> None:
+    """Score a finished run again and write its summary and report. Needs no renderer."""
+    from disco_twin.console import run_log
+    from disco_twin.run import print_scores, reopen_run, score_stages
+
+    opened = reopen_run(out, methods, console)
+    with run_log(opened.folder.root / "run.log"):
+        print_scores(score_stages(opened), opened.methods, console)
+
+
+@app.command()
+def plan(scene: SceneFile, profile: ProfileOption = "full") -> None:
+    """Predict images, bytes and time of a scene, and say what it leaves out. Needs no renderer."""
+    from disco_twin.predict import predict
+    from disco_twin.scene import load_scene
+    from disco_twin.world import World
+
+    for name, value in predict(World(load_scene(scene, profile))):
+        console.print(f"  {name:<12} {value}", highlight=False, soft_wrap=True)
+
+
+@app.command()
+def doctor() -> None:
+    """Check the installation: versions, LLVM, a small render, memory, disk. Exit status 1 if something is missing."""
+    from disco_twin.doctor import examine
+
+    findings = examine(Path.cwd())
+    for finding in findings:
+        console.print(str(finding), highlight=False, markup=False, soft_wrap=True)
+    if not all(f.good for f in findings):
+        raise typer.Exit(1)
+
+
+def main(arguments: list[str] | None = None) -> Any:
+    """Entry point of `disco-twin`."""
+    try:
+        return app(arguments)
+    except Interrupted as error:
+        return _stop(str(error), 130)
+    except DiscoError as error:
+        return _stop(str(error), 2)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EROFS):
+            raise
+        where = f"{error.filename}: " if error.filename else ""
+        return _stop(f"{where}{error.strerror}. Remedy: choose or mend the output folder, repeat the same command", 2)
+
+
+def _stop(message: str, status: int) -> None:
+    Console(stderr=True).print(f"disco-twin: {message}", style="red", highlight=False, markup=False, soft_wrap=True)
+    sys.exit(status)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""A run folder's results as the report wants them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_twin.figures import Comparison, Impulse
+from disco_twin.folder import RunFolder
+from disco_twin.report import ReportData
+from disco_twin.score import load_reflectance, load_relit, load_scores
+from disco_twin.simulate import reference_path
+from disco_twin.world import World, mm_per_pixel
+
+F64 = NDArray[np.float64]
+
+SPOTS_SHOWN = 4
+
+
+def collect(world: World, folder: RunFolder, summary: dict[str, Any]) -> ReportData:
+    """Read what the report shows."""
+    from disco_twin.light.truth import Truth
+
+    scene = world.scene
+    methods = list(dict.fromkeys(row["method"] for row in summary["relit"]))
+    truth = Truth.load(folder.twin / "truth.npz")
+    points = np.asarray(world.scan.vertices, np.float64)
+    distance = np.linalg.norm(points[truth.columns][:, None] - points[None], axis=2)
+    models = {}
+    for method in methods:
+        if (model := load_reflectance(folder, method)) is not None:
+            models[method] = np.asarray(model[0][:, truth.columns], np.float64)
+    seconds = json.loads((folder.work / "pipeline.json").read_text())["methods"]
+    launched = truth.balance.launched
+    return ReportData(
+        summary=summary,
+        wavelengths_nm=[laser.wavelength_nm for laser in scene.rig.lasers],
+        main=summary["method"],
+        impulses=impulses(world, folder.capture),
+        comparisons=comparisons(world, folder, methods, summary["relit"]),
+        distance=distance,
+        truth=truth.mean,
+        models=models,
+        decades=load_scores(folder)["reflectance"],
+        seconds={name: float(entry["seconds"]) for name, entry in seconds.items()},
+        balance={
+            term: list(getattr(truth.balance, term) / launched)
+            for term in ("escaped", "absorbed", "reflected", "boundary", "inside")
+        },
+        notes=notes(world),
+    )
+
+
+def notes(world: World) -> list[str]:
+    """What a reader must know before believing the figures."""
+    if world.scene.rig.faults.deviation:
+        return ["The actual rig deviates from the nominal one; the pipeline is told the nominal one only."]
+    return [
+        "The rig's deviation is off: poses and projector are exactly the nominal ones, as a perfect calibration "
+        "would find them."
+    ]
+
+
+def impulses(world: World, capture: Path) -> list[list[Impulse]]:
+    """Rows: cameras, columns: spots spread over the turntable angles; at the laser of the longest wavelength."""
+    from disco_twin.camera.lars3 import lars3_sensor
+    from pipeline.calibrate.calibration import nominal_calibration
+    from pipeline.capture.plan import ImageAddress
+    from pipeline.capture.stream import StreamReader
+
+    rig = world.scene.rig
+    calibration = nominal_calibration(rig, lars3_sensor(rig))
+    laser = int(np.argmax([x.wavelength_nm for x in rig.lasers]))
+    rows: list[list[Impulse]] = [[] for _ in rig.cameras]
+    with StreamReader(capture) as stream:
+        plan = stream.plan
+        for spot in np.unique(np.linspace(0, len(plan.spots) - 1, SPOTS_SHOWN).astype(int)):
+            angle = plan.spots[spot].angle
+            for camera, config in enumerate(rig.cameras):
+                view = camera * len(plan.angles_rad) + angle
+                address = ImageAddress(view, "spot", int(spot), laser)
+                image = calibration.radiance(stream.read(address), view, laser)
+                power = stream.meta(address).photodiode_w or calibration.lasers[laser].power_w
+                radiance = (image.radiance / power).astype(np.float32)
+                rows[camera].append(Impulse(config.name, int(spot), radiance, mm_per_pixel(config)))
+    return rows
+
+
+def comparisons(
+    world: World, folder: RunFolder, methods: Sequence[str], relit: Sequence[dict[str, Any]]
+) -> list[Comparison]:
+    """Relit images beside the reference (its subsurface layer, both halves together) for every light and view."""
+    from disco_twin.light.references import LAYERS, load_reference
+
+    out = []
+    layer = LAYERS.index("subsurface")
+    for light in world.scene.relight.lights:
+        for view in world.scene.relight.views:
+            reference = load_reference(reference_path(folder.twin / "references", light, view)).halves[:, layer]
+            rows = [r for r in relit if r["light"] == light.name and r["view"] == view.name]
+            out.append(
+                Comparison(
+                    light.name,
+                    view.name,
+                    reference.mean(axis=0),
+                    {m: load_relit(folder, m, light.name, view.name) for m in methods},
+                    world.object_mask(view),
+                    mm_per_pixel(view),
+                    {r["method"]: r["nrmse"] for r in rows},
+                )
+            )
+    return out

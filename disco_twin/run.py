@@ -1,0 +1,184 @@
+"""`disco-twin run`: from a scene to scores and the report, stage by stage; what is finished is not done again."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+from rich.console import Console
+
+from disco_twin.console import Report, run_log, stage_bar
+from disco_twin.folder import RunFolder, content_key, source_key, write_atomically
+from disco_twin.pipeline_process import pipeline_inputs, reconstruct_apart
+from disco_twin.scene import Profile, Scene, load_scene
+from disco_twin.world import World, identity, left_out_by_the_twin
+from hw.errors import InputError
+from pipeline.capture.loop import Interrupted
+from pipeline.reconstruct.settings import Method
+
+log = logging.getLogger(__name__)
+
+METHODS: tuple[str, ...] = get_args(Method)
+BASELINES = ("dipole", "lambertian")
+SCENE_RECORD = "scene.json"  # the scene as it was run: profile applied, file names absolute
+
+
+@dataclass(frozen=True)
+class Run:
+    """A scene in its run folder. `scene_file` is where the scene came from (shipped references lie beside it)."""
+
+    world: World
+    folder: RunFolder
+    scene_file: Path
+    methods: tuple[str, ...]
+    console: Console
+
+    @property
+    def scene(self) -> Scene:
+        return self.world.scene
+
+    def stage(self, name: str, key: str, work: Callable[[Report], Any], unit: str = "") -> None:
+        """Do one stage with its progress bar and say what it took; `work` may return its own peak memory in MiB."""
+
+        def watched() -> float | None:
+            with stage_bar(self.console, name, unit) as report:
+                peak = work(report)
+            return peak if isinstance(peak, float) else None
+
+        try:
+            done = self.folder.run(name, key, watched)
+        except KeyboardInterrupt:
+            raise Interrupted(f"stopped during {name}; the same command continues") from None
+        record = self.folder.stages[name]
+        note = f"{record.seconds:8.1f} s {record.peak_mb:8.0f} MiB" if done else "finished before"
+        self.console.print(f"  {name:<12} {note}", highlight=False)
+
+
+def open_run(scene_file: Path, out: Path, profile: Profile, methods: str | None, console: Console) -> Run:
+    """Read the scene and claim the folder for it."""
+    scene = load_scene(scene_file, profile)
+    chosen = choose_methods(methods, scene)
+    folder = RunFolder.claim(out, scene_file, identity(scene))
+    write_atomically(folder.root / SCENE_RECORD, scene.model_dump_json(indent=1).encode())
+    return Run(World(scene), folder, scene_file, chosen, console)
+
+
+def reopen_run(out: Path, methods: str | None, console: Console) -> Run:
+    """An existing run folder, to do a part of it again."""
+    folder = RunFolder.open(out)
+    record = out / SCENE_RECORD
+    try:
+        scene = Scene.model_validate_json(record.read_bytes())
+    except (OSError, ValueError) as error:
+        problem = str(error).splitlines()[0]
+        raise InputError(f"cannot be read ({problem})", file=record, remedy="disco-twin run") from error
+    return Run(World(scene), folder, folder.scene_file, choose_methods(methods, scene), console)
+
+
+def choose_methods(text: str | None, scene: Scene) -> tuple[str, ...]:
+    """`default,disco2004` or `all`, or else the scene's; the cheap baselines are always scored."""
+    if text is None:
+        chosen: list[str] = list(scene.reconstruct.methods)
+    else:
+        chosen = list(METHODS) if text == "all" else [m.strip() for m in text.split(",") if m.strip()]
+    unknown = [m for m in chosen if m not in METHODS]
+    if unknown or not chosen:
+        value = unknown[0] if unknown else text
+        raise InputError("unknown method", key="--methods", value=value, allowed=f"all, {', '.join(METHODS)}")
+    return tuple(dict.fromkeys([*chosen, *BASELINES]))
+
+
+def capture_stages(run: Run) -> None:
+    """Scan and capture."""
+    from disco_twin import simulate
+
+    key = run.folder.identity
+    run.stage("scan", key, lambda _: simulate.write_scan(run.world, run.folder.capture))
+    run.stage("capture", key, lambda report: simulate.take_images(run.world, run.folder, report), "images")
+
+
+def truth_stages(run: Run) -> None:
+    """Ground-truth R_d and the reference images."""
+    from disco_twin import simulate
+    from disco_twin.world import reference_key
+
+    scene, folder = run.scene, run.folder
+    run.stage(
+        "truth",
+        folder.identity,
+        lambda report: simulate.compute_truth(run.world, folder.twin / "truth.npz", report),
+        "columns",
+    )
+    keys = [reference_key(scene, light, view) for light in scene.relight.lights for view in scene.relight.views]
+    shipped = simulate.shipped_references(run.scene_file, scene.name)
+    run.stage(
+        "references",
+        content_key(keys, scene.simulation.reference_walks),
+        lambda report: simulate.render_references(run.world, shipped, folder.twin / "references", report),
+        "lights",
+    )
+
+
+def pipeline_stage(run: Run) -> None:
+    """Reconstruct and relight, in a process of its own that is given the capture and nothing of the truth."""
+    key = content_key(run.folder.identity, pipeline_inputs(run.scene, run.methods), source_key("pipeline"))
+    run.stage("pipeline", key, lambda _: reconstruct_apart(run.scene, run.folder, run.methods))
+
+
+def score_stages(run: Run) -> dict[str, Any]:
+    """Scores, summary.json and report.html; the summary."""
+    from disco_twin.report import write_report
+    from disco_twin.results import collect
+    from disco_twin.score import load_scores, score_run
+    from disco_twin.summary import make_summary, write_summary
+
+    stages = run.folder.stages
+    for name in ("capture", "truth", "references", "pipeline"):
+        if name not in stages or not stages[name].finished:
+            raise InputError(f"the stage {name} is not finished", file=run.folder.root, remedy="disco-twin run")
+    key = content_key(
+        *(stages[name].key for name in ("truth", "references", "pipeline")),
+        source_key("disco_twin.score"),
+        source_key("pipeline.relight.scores"),
+    )
+    run.stage("scores", key, lambda _: score_run(run.world, run.folder, run.methods))
+    made = json.loads((run.folder.work / "pipeline.json").read_text())
+    rows = [{"name": s.name, "seconds": s.seconds, "peak_mb": s.peak_mb} for s in stages.values()]
+    left_out = [*left_out_by_the_twin(run.world), *made["left_out"]]
+    summary = make_summary(run.scene, run.folder, run.methods[0], rows, load_scores(run.folder), left_out)
+    write_summary(summary, run.folder.summary_file)
+    write_report(collect(run.world, run.folder, summary), run.folder.report_file)
+    return summary
+
+
+def run_all(run: Run) -> dict[str, Any]:
+    """Everything, from the scan to the report."""
+    with run_log(run.folder.root / "run.log"):
+        capture_stages(run)
+        truth_stages(run)
+        pipeline_stage(run)
+        return score_stages(run)
+
+
+def print_scores(summary: dict[str, Any], methods: Sequence[str], console: Console) -> None:
+    """A table of nrmse by light and method."""
+    from rich.table import Table
+
+    from disco_twin.report import rms
+
+    relit = summary["relit"]
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    table.add_column("nrmse")
+    for method in methods:
+        table.add_column(method, justify="right")
+    for light in dict.fromkeys(r["light"] for r in relit):
+        cells = [
+            rms([r["nrmse"] for r in relit if r["light"] == light and r["method"] == method]) for method in methods
+        ]
+        table.add_row(light, *(f"{c:.3f}" for c in cells))
+    console.print()
+    console.print(table)

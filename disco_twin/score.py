@@ -1,0 +1,104 @@
+"""Relit images against references, R_d against the truth: design.md's scores for every method of a run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_twin.folder import RunFolder, write_atomically
+from disco_twin.simulate import reference_path
+from disco_twin.world import World
+from hw.errors import InputError
+
+FORMAT_VERSION = 1
+F32 = NDArray[np.float32]
+
+
+def score_run(world: World, folder: RunFolder, methods: Sequence[str]) -> None:
+    """Write OUT/twin/scores.json: `relit` rows of every light, view and method, and `reflectance` by method."""
+    scores = {
+        "format_version": FORMAT_VERSION,
+        "relit": score_relit_images(world, folder, methods),
+        "reflectance": score_models(folder, methods),
+    }
+    write_atomically(scores_file(folder), json.dumps(scores, indent=1).encode())
+
+
+def scores_file(folder: RunFolder) -> Path:
+    """Where the scores lie: with the truth that they were made from, apart from the pipeline's work."""
+    return folder.twin / "scores.json"
+
+
+def load_scores(folder: RunFolder) -> dict[str, Any]:
+    """What `score_run` wrote."""
+    data: dict[str, Any] = json.loads(scores_file(folder).read_text())
+    if data["format_version"] != FORMAT_VERSION:
+        raise InputError("unknown format_version", file=scores_file(folder), remedy="disco-twin score")
+    return data
+
+
+def score_relit_images(world: World, folder: RunFolder, methods: Sequence[str]) -> list[dict[str, Any]]:
+    """Rows {light, view, method, nrmse, nrmse_se, nrmse_floor, psnr, energy_ratio}."""
+    from disco_twin.light.references import LAYERS, load_reference
+    from pipeline.relight.scores import score_relit
+
+    rows = []
+    masks = {view.name: world.object_mask(view) for view in world.scene.relight.views}
+    layer = LAYERS.index("subsurface")  # R_d answers for light from below the surface
+    for light in world.scene.relight.lights:
+        for view in world.scene.relight.views:
+            a, b = load_reference(reference_path(folder.twin / "references", light, view)).halves[:, layer]
+            for method in methods:
+                image = load_relit(folder, method, light.name, view.name)
+                score = asdict(score_relit(image, a, b, masks[view.name]))
+                kept = ("nrmse", "nrmse_se", "nrmse_floor", "psnr", "energy_ratio")
+                row = {"light": light.name, "view": view.name, "method": method}
+                rows.append(row | {k: score[k] for k in kept})
+    return rows
+
+
+def load_relit(folder: RunFolder, method: str, light: str, view: str) -> F32:
+    """(L, H, W) relit image in W/(mm^2 sr)."""
+    path = folder.work / "relit" / method / f"{light}@{view}.npy"
+    if not path.is_file():
+        raise InputError("is missing", file=path, remedy=f"disco-twin reconstruct --out {folder.root}")
+    return np.asarray(np.load(path, allow_pickle=False))
+
+
+def load_reflectance(folder: RunFolder, method: str) -> tuple[F32, NDArray[np.bool_]] | None:
+    """R_d (L, V, V) in mm^-2 and which entries were measured (V, V); None if the method has no R_d (Lambertian)."""
+    path = folder.work / f"model-{method}.npz"
+    if not path.is_file():
+        return None
+    with np.load(path, allow_pickle=False) as data:
+        if "reflectance" not in data:
+            return None
+        return data["reflectance"], data["measured"]
+
+
+def score_models(folder: RunFolder, methods: Sequence[str]) -> dict[str, Any]:
+    """By method: log10_rmse of measured and of all entries and the coverage, each by decade below the peak."""
+    from disco_twin.light.truth import Truth
+    from pipeline.relight.scores import score_reflectance
+
+    truth = Truth.load(folder.twin / "truth.npz")
+    out: dict[str, Any] = {}
+    for method in methods:
+        model = load_reflectance(folder, method)
+        if model is None:
+            continue
+        estimate, measured = model[0][:, truth.columns], np.asarray(model[1])[..., truth.columns, :]
+        own = score_reflectance(estimate, truth.mean, truth.standard_error, measured)
+        full = score_reflectance(estimate, truth.mean, truth.standard_error, True)
+        out[method] = {
+            "measured": {str(s.decade): s.log10_rmse for s in own},
+            "completed": {str(s.decade): s.log10_rmse for s in full},
+            "coverage": {str(s.decade): s.coverage for s in own},
+        }
+    return out
