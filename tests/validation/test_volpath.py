@@ -17,12 +17,12 @@ import trimesh
 from disco_twin.light.references import render_reference
 from disco_twin.light.transport import Transport
 from disco_twin.object.build import Boundary, Medium, TwinObject
+from benchmarks.volpath import volpath_scene
 from pipeline.calibrate.camera import PinholeCamera, look_at
 from pipeline.relight.lights import Directional, Uniform
 from tests.validation.significance import assert_z, z_of_difference
 
 BLOCK, PIXELS = 4, 24
-DEPTH = 4000
 
 
 def bumpy(boundary: Boundary, heterogeneous: bool) -> TwinObject:
@@ -31,13 +31,15 @@ def bumpy(boundary: Boundary, heterogeneous: bool) -> TwinObject:
     """
     ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
     x, y, z = ball.vertices.T
-    radius = 5 * (1 + 0.12 * np.sin(3 * x + 1) * np.cos(2.5 * y) - 0.25 * np.exp(-((x - 0.7) ** 2 + y**2 + (z - 0.6) ** 2) / 0.2))
+    dent = np.exp(-((x - 0.7) ** 2 + y**2 + (z - 0.6) ** 2) / 0.2)
+    radius = 5 * (1 + 0.12 * np.sin(3 * x + 1) * np.cos(2.5 * y) - 0.25 * dent)
     mesh = trimesh.Trimesh(ball.vertices * radius[:, None], ball.faces, process=False)
     low, high = mesh.bounds[0] - 0.1, mesh.bounds[1] + 0.1
     shape = (6, 7, 8) if heterogeneous else (1, 1, 1)
     sigma_t = np.random.default_rng(5).uniform(0.4, 1.6, shape) if heterogeneous else np.full(shape, 1.0)
     albedo = np.full(shape, 0.92)
-    return TwinObject(mesh, boundary, Medium(sigma_t[None].astype(np.float32), albedo[None].astype(np.float32), low, high, (0.3,)))
+    medium = Medium(sigma_t[None].astype(np.float32), albedo[None].astype(np.float32), low, high, (0.3,))
+    return TwinObject(mesh, boundary, medium)
 
 
 def camera_of() -> PinholeCamera:
@@ -45,53 +47,11 @@ def camera_of() -> PinholeCamera:
     return PinholeCamera(PIXELS, PIXELS, np.array([175.0, 175.0]), np.full(2, PIXELS / 2), np.zeros(5), pose)
 
 
-def volpath_images(obj: TwinObject, camera: PinholeCamera, light: Directional | Uniform, folder: Path, passes: int, spp: int) -> np.ndarray:
+def volpath_images(
+    obj: TwinObject, camera: PinholeCamera, light: Directional | Uniform, folder: Path, passes: int, spp: int
+) -> np.ndarray:
     """(passes, H, W) independent renders by stock volpath of the light that the object sends to the camera."""
-    path = folder / "object.ply"
-    obj.mesh.export(path, vertex_normal=False)
-    medium = obj.medium
-    size = medium.high - medium.low
-    to_world = mi.ScalarTransform4f().translate(list(medium.low)).scale(list(size))
-
-    def volume(values: np.ndarray) -> dict[str, object]:
-        grid = mi.VolumeGrid(np.ascontiguousarray(values[..., None], np.float32))
-        return {"type": "gridvolume", "grid": grid, "to_world": to_world, "filter_type": "trilinear", "wrap_mode": "clamp"}
-
-    eta = obj.boundary.eta
-    bsdf = {"type": "null"} if obj.boundary.kind == "matched" else {
-        "type": "roughdielectric", "int_ior": eta, "ext_ior": 1.0, "alpha": obj.boundary.alpha, "distribution": "ggx",
-    }  # fmt: skip
-    emitter = (
-        {"type": "constant", "radiance": 1.0}
-        if isinstance(light, Uniform)
-        else {"type": "directional", "direction": list(light.direction), "irradiance": 1.0}
-    )
-    forward, up = camera.pose[2, :3], -camera.pose[1, :3]
-    target = camera.position + forward
-    view = mi.ScalarTransform4f().look_at(origin=list(camera.position), target=list(target), up=list(up))
-    fov = float(np.degrees(2 * np.arctan(camera.width / 2 / camera.focal[0])))
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "emitter": emitter,
-            "object": {
-                "type": "ply", "filename": str(path), "face_normals": True, "bsdf": bsdf,
-                "interior": {
-                    "type": "heterogeneous", "sigma_t": volume(medium.sigma_t[0]), "albedo": volume(medium.albedo[0]),
-                    "has_spectral_extinction": False, "phase": {"type": "hg", "g": medium.g[0]},
-                },
-            },
-            "sensor": {
-                "type": "perspective", "fov": fov, "fov_axis": "x", "to_world": view,
-                "film": {
-                    "type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "luminance",
-                    "rfilter": {"type": "box"}, "component_format": "float32",
-                },
-                "sampler": {"type": "independent"},
-            },
-            "integrator": {"type": "volpath", "max_depth": DEPTH, "rr_depth": DEPTH, "hide_emitters": True},
-        }
-    )  # fmt: skip
+    scene = volpath_scene(obj, camera, light, folder)
     images = [np.array(mi.render(scene, spp=spp, seed=seed))[..., 0] for seed in range(passes)]
     return np.stack(images).astype(np.float64)
 
