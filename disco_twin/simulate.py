@@ -57,16 +57,11 @@ def take_images(world: World, folder: RunFolder, progress: Progress) -> CaptureR
 
 def compute_truth(world: World, path: Path, progress: Progress) -> None:
     """Columns of the true R_d, from photons of their own."""
-    transport = world.transport
-    from disco_twin.light.truth import truth_columns
-    from disco_twin.object.mesh import hat_basis
-
-    basis = hat_basis(world.object.mesh, world.scan)
-    columns = world.truth_columns()
+    columns, walks = world.truth_columns(), world.scene.simulation.truth_walks
     parts = []
     for low in range(0, len(columns), COLUMNS_AT_ONCE):
         part = columns[low : low + COLUMNS_AT_ONCE]
-        parts.append(truth_columns(transport, basis, part, world.scene.simulation.truth_walks, world.seed("truth")))
+        parts.append(world.truth(part, walks))
         progress(low + len(part), len(columns))
     joined(parts).save(path)
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import trimesh
 
     from disco_twin.light.transport import Transport
+    from disco_twin.light.truth import Truth
     from disco_twin.object.build import TwinObject
     from pipeline.capture.plan import Plan
 
@@ -75,6 +76,15 @@ class World:
 
         points = np.asarray(self.scan.vertices, float)
         return np.sort(farthest_points(points, np.ones(len(points)), self.scene.simulation.truth_columns))
+
+    def truth(self, columns: Sequence[int] | NDArray[np.int64], walks: int) -> Truth:
+        """True R_d from these scan vertices to all others, from `walks` photons a column."""
+        transport = self.transport
+        from disco_twin.light.truth import truth_columns
+        from disco_twin.object.mesh import hat_basis
+
+        basis = hat_basis(self.object.mesh, self.scan)
+        return truth_columns(transport, basis, np.asarray(columns, np.int64), walks, self.seed("truth"))
 
     def object_mask(self, view: CameraConfig) -> NDArray[np.bool_]:
         """(H, W) pixels of a held-out view that the object fills by at least a half."""

@@ -1,0 +1,112 @@
+"""Bad input gets one line on stderr and exit status 2, never a traceback."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from disco_twin import run as run_module
+from disco_twin.cli import main
+from hw.errors import DiscoError
+from pipeline.capture.loop import Interrupted
+
+
+def status_and_line(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    code = stop.value.code
+    assert isinstance(code, int)
+    return code, lines[0]
+
+
+def edited(repository: Path, folder: Path, old: str, new: str) -> Path:
+    text = (repository / "scenes" / "quick.toml").read_text()
+    assert old in text
+    path = folder / "scene.toml"
+    path.write_text(text.replace(old, new, 1))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('name = "quick"', 'name = "quick', "not valid TOML"),
+        ('name = "quick"', 'name = "quick"\nsede = 3', "seed"),
+        ("spots = 300", "spots = 0", "rig.spots"),
+        ("position_mm = [390.0, -120.0, 190.0]", "position_mm = [390.0, -120.0, 190.0]\naim_mm = [900.0, 0.0, 0.0]",
+         "does not see the object"),
+        ("[rig.projector]", "[rig.projector]\naim_mm = [600.0, 900.0, 0.0]", "never hits the object"),
+        ("size_mm = [40.0", "size_mm = [-40.0", "size_mm"),
+    ],
+)  # fmt: skip
+def test_bad_scenes(
+    old: str, new: str, said: str, repository: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = edited(repository, tmp_path, old, new)
+    status, line = status_and_line(["run", str(scene), "--out", str(tmp_path / "out")], capsys)
+    assert status == 2
+    assert said in line
+
+
+def test_a_missing_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, line = status_and_line(["run", str(tmp_path / "no.toml"), "--out", str(tmp_path / "out")], capsys)
+    assert status == 2
+    assert "no such file" in line
+
+
+def test_the_folder_of_another_scene(repository: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    quick = repository / "scenes" / "quick.toml"
+    run_module.open_run(quick, tmp_path / "out", "small", None, run_module.Console(quiet=True))
+    for arguments in (["run", str(quick)], ["capture", str(repository / "scenes" / "slab.toml")]):
+        status, line = status_and_line([*arguments, "--out", str(tmp_path / "out")], capsys)
+        assert status == 2
+        assert "another scene" in line
+
+
+def test_an_unknown_method_names_the_known_ones(
+    repository: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    quick = str(repository / "scenes" / "quick.toml")
+    status, line = status_and_line(["run", quick, "--out", str(tmp_path / "out"), "--methods", "disco2005"], capsys)
+    assert status == 2
+    assert "disco2005" in line
+    assert "disco2004" in line
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "out/x"), 2, "No space left on device"),
+        (Interrupted("stopped: 3 of 9 images are stored; the same command continues"), 130, "same command continues"),
+        (KeyboardInterrupt(), 130, "stopped during scan; the same command continues"),
+        (DiscoError("the reason"), 2, "the reason"),
+    ],
+)
+def test_what_goes_wrong_later(
+    error: BaseException,
+    status: int,
+    said: str,
+    repository: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("disco_twin.simulate.write_scan", fail)
+    quick = str(repository / "scenes" / "quick.toml")
+    found, line = status_and_line(["run", quick, "--out", str(tmp_path / "out"), "--profile", "small"], capsys)
+    assert found == status
+    assert said in line
+
+
+def test_score_without_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, line = status_and_line(["score", "--out", str(tmp_path)], capsys)
+    assert status == 2
+    assert "no run folder" in line
