@@ -1,52 +1,87 @@
-"""`python -m benchmarks NAME --json FILE [--quick]`: run a benchmark and keep its figures as JSON."""
+"""`python -m benchmarks NAME --json FILE [--quick]`: run a benchmark, show its figures, keep them as one JSON object.
+
+A benchmark is a module with `run(quick: bool) -> dict`; what all have in common (commit, cores, seconds, peak memory)
+is added here.
+"""
 
 from __future__ import annotations
 
 import argparse
 import importlib
 import json
-import platform
+import resource
+import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from disco_twin.resources import measured, total_memory_gb, usable_cores
+from disco_twin.resources import measured, usable_cores
 
-# name -> module with `run(quick: bool) -> dict`; imported only when it is asked for.
 REGISTRY = {
     "irradiance": "benchmarks.irradiance",
     "pareto": "benchmarks.pareto",
+    "walk": "benchmarks.walk",
 }
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one benchmark; exit status 2 for a name that does not exist."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Error against run time, and the like.")
     parser.add_argument("name", choices=sorted(REGISTRY))
     parser.add_argument("--json", type=Path, required=True, metavar="FILE", help="where the figures go")
-    parser.add_argument("--quick", action="store_true", help="smaller: shows that it works, its figures mean little")
+    parser.add_argument("--quick", action="store_true", help="the same code on smaller sizes, in under a minute")
     options = parser.parse_args(arguments)
     module = importlib.import_module(REGISTRY[options.name])
+    before = _cpu_seconds()
     with measured() as usage:
         figures: dict[str, Any] = module.run(quick=options.quick)
     record = {
         "format_version": 1,
-        "benchmark": options.name,
+        "name": options.name,
         "quick": options.quick,
-        "machine": {
-            "cores": usable_cores(),
-            "memory_gb": round(total_memory_gb(), 1),
-            "processor": platform.machine(),
-            "python": platform.python_version(),
-        },
+        "commit": _commit(),
+        "cores": usable_cores(),
+        "cpu_over_wall": (_cpu_seconds() - before) / usage.seconds,
         "seconds": usage.seconds,
         "peak_mb": usage.peak_mb,
-        "figures": figures,
     }
+    record |= {key: value for key, value in figures.items() if key not in record}
     options.json.parent.mkdir(parents=True, exist_ok=True)
-    options.json.write_text(json.dumps(record, indent=1) + "\n")
-    print(f"{options.name}: {usage.seconds:.1f} s, figures in {options.json}")
+    options.json.write_text(json.dumps(record, indent=1, allow_nan=False) + "\n")
+    for line in readable(record):
+        print(line)
     return 0
+
+
+def readable(record: dict[str, Any]) -> Iterator[str]:
+    """A table: the plain figures, then a line for every point of a curve."""
+    for key, value in record.items():
+        if not isinstance(value, list | dict):
+            yield f"{key:<24} {value:.4g}" if isinstance(value, float) else f"{key:<24} {value}"
+    for curve in record.get("curves", []):
+        for point in curve["points"]:
+            settings = ", ".join(f"{k} {v}" for k, v in point.get("settings", {}).items())
+            yield f"{curve['name']:<24} {point['seconds']:9.3f} s   error {point['error']:.3g}   {settings}"
+
+
+def _cpu_seconds() -> float:
+    """Seconds of all cores, children included."""
+    both = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(u.ru_utime + u.ru_stime for u in both)
+
+
+def _commit() -> str:
+    """The checkout's commit, with + when it has been changed since; unknown outside a checkout."""
+    here = Path(__file__).resolve().parent
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", "-C", str(here), *words], capture_output=True, text=True, check=True).stdout
+
+    try:
+        return git("rev-parse", "--short", "HEAD").strip() + ("+" if git("status", "--porcelain").strip() else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
 
 
 if __name__ == "__main__":
