@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from pipeline.reconstruct.mesh import interpolation, vertex_areas
-from pipeline.reconstruct.samples import Spots
+from pipeline.reconstruct.spots import Spots
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import trimesh
@@ -17,38 +18,21 @@ from scipy import ndimage
 
 from hw.record import RadianceImage
 from pipeline.calibrate.calibration import Calibration
-from pipeline.calibrate.fresnel import transmittance
 from pipeline.capture.plan import ImageAddress, Plan
 from pipeline.capture.stream import CorruptImage, StreamReader
-from pipeline.reconstruct.mesh import first_hit, interpolated_normals
+from pipeline.reconstruct.distances import Pairs, spot_pairs, vertex_pairs
 from pipeline.reconstruct.settings import ReconstructConfig
+from pipeline.reconstruct.spots import Spots, locate_spots
 from pipeline.reconstruct.views import Reading
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
-I64 = NDArray[np.int64]
 
 log = logging.getLogger(__name__)
 
 MIN_SHARE = 0.5  # of a vertex's hat that a camera must see
 # Response of [1 -2 1]^T [1 -2 1] / 6 to white noise has the noise's variance, and none to a linear slope (Immerkaer 1996).
 NOISE_MASK = np.outer([1, -2, 1], [1, -2, 1]) / 6.0
-
-
-@dataclass(frozen=True)
-class Spots:
-    """Where the beam's axis meets the scan. All of length S, object frame, mm.
-
-    transmitted: F_t(w_i), 0 for spots that are not used (the beam misses the scan or meets it too obliquely)
-    """
-
-    position: F64  # (S, 3)
-    direction: F64  # (S, 3) unit, of travel
-    normal: F64  # (S, 3) unit
-    triangle: I64  # (S,)
-    barycentric: F64  # (S, 3)
-    transmitted: F64  # (S,)
-    beam_radius: float
 
 
 @dataclass(frozen=True)
@@ -71,6 +55,16 @@ class Samples:
         """(L, S, V) variance of the values as measured, mm^-4."""
         return np.asarray(self.dark_variance + self.noise_per_signal * np.maximum(self.values, 0.0))
 
+    @cached_property
+    def spot_pairs(self) -> Pairs:
+        """Distances between the beams and the hat functions."""
+        return spot_pairs(self.mesh, self.spots)
+
+    @cached_property
+    def vertex_pairs(self) -> Pairs:
+        """Distances between the hat functions."""
+        return vertex_pairs(self.mesh)
+
 
 @dataclass(frozen=True)
 class SampleStatistics:
@@ -83,21 +77,6 @@ class SampleStatistics:
     spots_too_oblique: int
     entries_in_highlight: int
     coverage: float
-
-
-def locate_spots(mesh: trimesh.Trimesh, calibration: Calibration, plan: Plan, settings: ReconstructConfig) -> Spots:
-    """Meet the calibrated beam axes with the scan."""
-    origins, direction = calibration.spot_rays(plan.spots)
-    hit = first_hit(mesh, origins, direction)
-    triangle = np.maximum(hit.triangle, 0)
-    barycentric = np.where(hit.triangle[:, None] >= 0, hit.barycentric, 1.0 / 3.0)
-    normal = interpolated_normals(mesh, triangle, barycentric)
-    cosine = -(normal * direction).sum(axis=1)
-    used = (hit.triangle >= 0) & (cosine > np.cos(np.deg2rad(settings.max_incidence_deg)))
-    position = (mesh.triangles[triangle] * barycentric[:, :, None]).sum(axis=1)
-    transmitted = np.where(used, transmittance(cosine, settings.eta), 0.0)
-    radius = calibration.projectors[0].beam_diameter_mm / 2
-    return Spots(position, direction, normal, triangle, barycentric, transmitted, radius)
 
 
 def noise_squared(image: NDArray[np.floating]) -> F64:
