@@ -116,7 +116,8 @@ def von_mises_fisher_pdf(cos_theta: Any, kappa: Any) -> Any:
 def von_mises_fisher(rng: Rng, axis: Any, kappa: Any) -> Any:
     """Direction from a von Mises-Fisher lobe (Jakob 2012, numerically stable sampling)."""
     u = rng.next()
-    cos_theta = 1.0 + dr.log(dr.maximum(u + (1.0 - u) * dr.exp(-2.0 * kappa), 1e-38)) / kappa
+    # 1e-37 is a normal number: whether a thread flushes denormal ones to zero must not matter.
+    cos_theta = 1.0 + dr.log(dr.maximum(u + (1.0 - u) * dr.exp(-2.0 * kappa), 1e-37)) / kappa
     cos_theta = dr.clip(cos_theta, -1.0, 1.0)
     sin_theta = dr.safe_sqrt(1.0 - cos_theta * cos_theta)
     s, c = dr.sincos(2.0 * math.pi * rng.next())

@@ -465,7 +465,8 @@ def walk(
             ray = mi.Ray3f(mi.Point3f(p + clear), d, reach, 0.0, mi.Color0f())
             si = t.scene.ray_intersect(ray, mi.RayFlags.Minimal, False, True)
             clear = mi.Vector3f(0.0)
-            if dr.hint(si.is_valid()):
+            # Measured from p itself: the lifted origin is nearer to the far wall, which matters in thin plates.
+            if dr.hint(si.is_valid() & (~inside | (dr.dot(si.p - p, d) < flight))):
                 outward = dr.dot(si.n, d) > 0.0
                 if dr.hint(t.matched, mode="scalar"):
                     leaves = mi.Bool(outward)
