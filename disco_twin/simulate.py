@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,11 +29,15 @@ COLUMNS_AT_ONCE = 4  # columns of truth between two words on the progress
 
 
 def write_scan(world: World, capture: Path) -> None:
-    """The nominal rig and the scanned mesh: what the pipeline is told beside the images. The loop writes the plan."""
+    """The nominal rig, its sensor, the scanned mesh: what the pipeline is told beside the images and their plan."""
+    from disco_twin.camera.lars3 import lars3_sensor
+
     _require_equal_sizes(world.scene.rig.cameras, "rig.cameras")
     world.plan  # noqa: B018 - refuses a rig that cannot capture this object before anything is simulated
     write_atomically(capture / "scan.ply", bytes(world.scan.export(file_type="ply")))
     write_atomically(capture / "rig.json", world.scene.rig.model_dump_json(indent=1).encode())
+    sensor = asdict(lars3_sensor(world.scene.rig))
+    write_atomically(capture / "sensor.json", json.dumps(sensor, indent=1).encode())
 
 
 def _require_equal_sizes(cameras: Sequence[CameraConfig], key: str) -> None:
@@ -131,8 +137,6 @@ def render_references(world: World, shipped: Path, own: Path, progress: Progress
 
 
 def _render(world: World, light: Light, views: Sequence[CameraConfig], own: Path, save: Callable[..., None]) -> None:
-    from dataclasses import replace
-
     transport = world.transport
     from disco_twin.light.references import render_reference
 

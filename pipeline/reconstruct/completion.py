@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from pipeline.reconstruct.harmonics import Harmonics, harmonics
 from pipeline.reconstruct.mesh import interpolation
@@ -53,13 +54,13 @@ class SymmetricField:
     penalty: F32
 
     @classmethod
-    def of(cls, basis: Harmonics, to_spots: object, range_mm: float) -> SymmetricField:
+    def of(cls, basis: Harmonics, to_spots: sparse.csr_array, range_mm: float) -> SymmetricField:
         """Matern on both sides: separable, so that G is smooth along rows and columns alike."""
         rough = basis.roughness(range_mm)
         penalty = rough[:, None] * rough[None, :]
         penalty *= (1.0 / penalty).sum()
         functions = basis.functions.astype(np.float32)
-        return cls(functions, np.asarray(to_spots @ functions, np.float32), penalty.astype(np.float32))  # type: ignore[operator]
+        return cls(functions, np.asarray(to_spots @ functions, np.float32), penalty.astype(np.float32))
 
     def at_spots(self, y: F32) -> F32:
         """(S, V) values of the field between spots and vertices."""
@@ -141,7 +142,7 @@ def unexplained(samples: Samples, basis: Harmonics, range_mm: float) -> F64:
     share = np.abs(gain) / np.maximum(np.abs(gain).sum(axis=0), 1e-12)
     seen = share.T @ np.isfinite(samples.values[0, used]).astype(np.float64)
     left = 1.0 - explained[:, None] * seen
-    return np.clip(np.minimum(left, left.T), 0.0, 1.0)
+    return np.asarray(np.clip(np.minimum(left, left.T), 0.0, 1.0))
 
 
 def measured_entries(samples: Samples) -> NDArray[np.bool_]:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from pipeline.reconstruct.completion import measured_entries, measured_of
+from pipeline.reconstruct.distances import Kernel
 from pipeline.reconstruct.mesh import vertex_areas
 from pipeline.reconstruct.model import ReflectanceModel
 from pipeline.reconstruct.samples import Samples
@@ -35,6 +36,10 @@ def dipole_reflectance(distance: F64, scattering: float, absorption: float, eta:
     return np.asarray(scattering / extinction / (4.0 * np.pi) * out)
 
 
+def _kernel(scattering: float, absorption: float, eta: float) -> Kernel:
+    return lambda distance: dipole_reflectance(distance, scattering, absorption, eta)
+
+
 def fit_dipole_laser(samples: Samples, laser: int) -> tuple[float, float]:
     """(sigma_s', sigma_a) in 1/mm: logarithms of linear means over bins of distance, and of the observed total."""
     pairs, measured = samples.spot_pairs, measured_of(samples, laser)
@@ -45,7 +50,7 @@ def fit_dipole_laser(samples: Samples, laser: int) -> tuple[float, float]:
     def totals(values: F64) -> F64:
         """Power per bin over the observed entries."""
         weight = (values * area)[measured.observed]
-        return np.bincount(bin_of[measured.observed], weight, minlength=BINS + 1)[:BINS]
+        return np.bincount(bin_of[measured.observed], weight, minlength=BINS + 1)[:BINS].astype(np.float64)
 
     seen = totals(measured.value)
     area_seen = totals(np.ones_like(measured.value))
@@ -53,7 +58,7 @@ def fit_dipole_laser(samples: Samples, laser: int) -> tuple[float, float]:
     use = (area_seen > 0) & (level > FAINTEST * level.max())
 
     def misfit(logs: F64) -> F64:
-        model = totals(pairs.mean(lambda d: dipole_reflectance(d, *np.exp(logs), samples.eta)))
+        model = totals(pairs.mean(_kernel(np.exp(logs[0]), np.exp(logs[1]), samples.eta)))
         energy = np.log(model[use].sum() / seen[use].sum())
         return np.append(np.log(model[use] / seen[use]), ENERGY_WEIGHT * energy)
 
@@ -65,7 +70,7 @@ def fit_dipole_laser(samples: Samples, laser: int) -> tuple[float, float]:
 def fit_dipole(samples: Samples) -> ReflectanceModel:
     """The baseline: samples -> model. Its kernel depends on distance alone."""
     found = [fit_dipole_laser(samples, laser) for laser in range(len(samples.values))]
-    kernels = [samples.vertex_pairs.mean(lambda d, p=p: dipole_reflectance(d, *p, samples.eta)) for p in found]  # type: ignore[misc]
+    kernels = [samples.vertex_pairs.mean(_kernel(s, a, samples.eta)) for s, a in found]
     reflectance = np.stack([0.5 * (k + k.T) for k in kernels]).astype(np.float32)
     told = "; ".join(f"sigma_s' {s:.4g}, sigma_a {a:.4g} per mm" for s, a in found)
     return ReflectanceModel(

@@ -112,7 +112,7 @@ def _pairs(mesh: trimesh.Trimesh, centres: F64, patches: list[tuple[F64, F64]], 
         first.append(np.full(len(near), i))
         second.append(near)
     histogram = sparse.csr_array(sparse.vstack(blocks))
-    middle = (np.arange(bins) + 0.5) * width
+    middle: F64 = (np.arange(bins, dtype=np.float64) + 0.5) * width
     return Pairs(distance, np.concatenate(first), np.concatenate(second), histogram, middle, spread)
 
 

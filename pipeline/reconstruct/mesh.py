@@ -39,7 +39,8 @@ def first_hit(mesh: trimesh.Trimesh, origins: F64, directions: F64) -> Hits:
 
 def vertex_areas(mesh: trimesh.Trimesh) -> F64:
     """(V,) integral of each vertex's hat function in mm^2; they add up to the mesh's area."""
-    return np.bincount(mesh.faces.ravel(), np.repeat(mesh.area_faces / 3.0, 3), minlength=len(mesh.vertices))
+    share = np.repeat(np.asarray(mesh.area_faces, np.float64) / 3.0, 3)
+    return np.bincount(mesh.faces.ravel(), share, minlength=len(mesh.vertices)).astype(np.float64)
 
 
 def interpolated_normals(mesh: trimesh.Trimesh, triangle: I64, barycentric: F64) -> F64:

@@ -80,9 +80,7 @@ class ReflectanceModel:
             raise InputError("unknown units", file=path, key="units", value=head.get("units"), remedy=remedy)
         _check(path, arrays)
         mesh = trimesh.Trimesh(arrays["vertices"], arrays["faces"], process=False)
-        return cls(
-            mesh, arrays["reflectance"], arrays["variance"], arrays["measured"], head["eta"], head["provenance"]
-        )
+        return cls(mesh, arrays["reflectance"], arrays["variance"], arrays["measured"], head["eta"], head["provenance"])
 
 
 def _check(path: Path, arrays: Mapping[str, NDArray[np.generic]]) -> None:

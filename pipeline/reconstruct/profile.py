@@ -27,7 +27,7 @@ ITERATIONS = 12
 
 @dataclass(frozen=True)
 class Measured:
-    """One laser's samples. (S, V) each: values mm^-2 (0 where unobserved), observed, dark variance, noise per signal."""
+    """One laser's samples, (S, V) each: value mm^-2 (0 where unobserved), observed, dark variance, noise per signal."""
 
     value: F64
     observed: NDArray[np.bool_]

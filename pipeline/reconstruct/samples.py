@@ -31,7 +31,7 @@ F32 = NDArray[np.float32]
 log = logging.getLogger(__name__)
 
 MIN_SHARE = 0.5  # of a vertex's hat that a camera must see
-# Response of [1 -2 1]^T [1 -2 1] / 6 to white noise has the noise's variance, and none to a linear slope (Immerkaer 1996).
+# Its response to white noise has the noise's variance, and none to a linear slope (Immerkaer 1996).
 NOISE_MASK = np.outer([1, -2, 1], [1, -2, 1]) / 6.0
 
 
@@ -92,7 +92,7 @@ class _Gathered:
         shape = (lasers, len(plan.spots), cameras, vertices)
         self.readings, self.plan = readings, plan
         self.squared = [r.operator.multiply(r.operator).tocsr() for r in readings]
-        self.touched = [(r.operator != 0).astype(np.float32).tocsr() for r in readings]
+        self.touched = [abs(r.operator).tocsr() for r in readings]
         self.value = np.full(shape, np.nan, np.float32)
         self.dark = np.zeros(shape, np.float32)
         self.noise = np.zeros(shape, np.float32)
@@ -104,7 +104,7 @@ class _Gathered:
         value = reading.operator @ image.radiance.ravel().astype(np.float64) * scale
         seen = reading.share > MIN_SHARE
         if image.saturated.any():
-            seen &= self.touched[view] @ image.saturated.ravel().astype(np.float32) == 0
+            seen &= self.touched[view] @ image.saturated.ravel().astype(np.float64) == 0
         self.value[at] = np.where(seen, value, np.nan)
         self.dark[at] = self.squared[view] @ np.full(noise.size, float(image.variance.min())) * scale**2
         self.noise[at] = self.squared[view] @ np.maximum(noise.ravel(), image.variance.ravel()) * scale**2
@@ -124,7 +124,7 @@ class _Gathered:
         return out
 
     def combined(self, mesh: trimesh.Trimesh, eta: float, spots: Spots) -> Samples:
-        """One value per laser, spot and vertex: the cameras' mean, by what they see of the footprint and how squarely."""
+        """One value per laser, spot and vertex: the cameras' mean, by share of the footprint seen and view cosine."""
         weight = np.zeros(self.value.shape[1:], np.float32)  # (S, C, V)
         for view, reading in enumerate(self.readings):
             rows = self.plan.spots_at(self.plan.angle_of(view))

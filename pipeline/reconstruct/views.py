@@ -76,7 +76,7 @@ def see_surface(mesh: trimesh.Trimesh, camera: PinholeCamera, max_view_deg: floa
     np.maximum.at(far, pixel, distance)
     width = np.median(distance, axis=0) / camera.focal.mean() if len(distance) else 1.0
     broken = (count > 0) & (far - near > JUMP * width)
-    unsafe = ndimage.binary_dilation((broken | (count < s * s)).reshape(shape), np.ones((3, 3))).ravel()
+    unsafe = ndimage.binary_dilation((broken | (count < s * s)).reshape(shape), np.ones((3, 3), bool)).ravel()
     keep = ~unsafe[pixel] & (np.minimum(cosine, flat) > np.cos(np.deg2rad(max_view_deg)))
     return Pixels(pixel[keep], mesh.faces[triangle[keep]], barycentric[keep], area[keep], cosine[keep])
 

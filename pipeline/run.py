@@ -1,0 +1,232 @@
+"""The pipeline's process: from a capture folder to models and relit images.
+
+It reads CAPTURE (rig.json, sensor.json, scan.ply, plan.json and the stream) and a request, and nothing else; it runs
+where no renderer is installed. It writes into WORK:
+
+    calibration.json  samples.npz  model-<method>.npz  relit/<method>/<light>@<view>.npy ((L, H, W) float32)
+    pipeline.json     stages, methods, capture statistics, what was left out and why, warnings
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import resource
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import numpy as np
+import trimesh
+from pydantic import Field, TypeAdapter, ValidationError
+
+from hw.errors import DiscoError, InputError
+from hw.record import Sensor
+from pipeline.calibrate.calibration import Calibration, nominal_calibration
+from pipeline.calibrate.camera import PinholeCamera
+from pipeline.capture.stream import StreamReader
+from pipeline.config import Strict
+from pipeline.reconstruct.methods import METHODS, READINGS, reconstruct
+from pipeline.reconstruct.model import ReflectanceModel
+from pipeline.reconstruct.needs import omissions
+from pipeline.reconstruct.samples import Samples, SampleStatistics, take_samples
+from pipeline.reconstruct.settings import ReconstructConfig
+from pipeline.reconstruct.views import Reading
+from pipeline.relight.irradiance import transmitted_flux
+from pipeline.relight.lights import Light
+from pipeline.relight.relight import view_matrix
+from pipeline.rig import CameraConfig, RigConfig
+
+FORMAT_VERSION = 1
+T = TypeVar("T")
+
+log = logging.getLogger(__name__)
+
+
+class RelightRequest(Strict):
+    """Lights and held-out cameras (object frame) to relight."""
+
+    views: tuple[CameraConfig, ...] = ()
+    lights: tuple[Light, ...] = ()
+
+
+class Request(Strict):
+    """What the pipeline is asked to do."""
+
+    format_version: Literal[1]
+    reconstruct: ReconstructConfig = ReconstructConfig()
+    relight: Annotated[RelightRequest, Field()] = RelightRequest()
+
+
+@dataclass
+class Stages:
+    """What every stage took, in order: name, seconds, peak resident memory in MiB (of the process so far)."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Measure a block."""
+        start = time.perf_counter()
+        yield
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+        self.rows.append({"name": name, "seconds": time.perf_counter() - start, "peak_mb": peak})
+        log.info("%s: %.1f s", name, self.rows[-1]["seconds"])
+
+
+def read_json(path: Path, schema: type[T], remedy: str) -> T:
+    """Validate a JSON file; any failure is one line."""
+    try:
+        return TypeAdapter(schema).validate_json(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", file=path, remedy=remedy) from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"]) or None
+        raise InputError(first["msg"], file=path, key=key, remedy=remedy) from error
+
+
+def read_scan(path: Path) -> trimesh.Trimesh:
+    """The scanned mesh in mm, vertices as they are numbered in the file."""
+    try:
+        mesh = trimesh.load(path, process=False)
+    except (OSError, ValueError, IndexError, KeyError) as error:
+        raise InputError(f"not a readable mesh ({error})", file=path, remedy="scan again") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise InputError("holds no triangles", file=path, remedy="scan again")
+    if not mesh.is_watertight or mesh.volume <= 0:
+        raise InputError("the scan is open or inside out", file=path, remedy="close it and orient its faces outward")
+    return mesh
+
+
+def save_samples(path: Path, samples: Samples) -> None:
+    """Arrays of the samples read by footprint: values in mm^-2, variances in mm^-4, positions in mm."""
+    np.savez(
+        path,
+        format_version=FORMAT_VERSION,
+        values=samples.values,
+        variance=samples.variance,
+        position=samples.spots.position,
+        triangle=samples.spots.triangle,
+        barycentric=samples.spots.barycentric,
+        transmitted=samples.spots.transmitted,
+        eta=samples.eta,
+    )
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Replace a file at once."""
+    partial = path.with_suffix(".part")
+    partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    os.replace(partial, path)
+
+
+def gather(
+    capture: Path, calibration: Calibration, mesh: trimesh.Trimesh, settings: ReconstructConfig, stages: Stages
+) -> tuple[dict[str, Samples], SampleStatistics]:
+    """Views, then samples, for every way of reading that the methods ask for (by footprint in any case)."""
+    ways = dict.fromkeys(["footprint", *(METHODS[m].reading for m in settings.methods)])
+    with stages.stage("views"):
+        cameras = [calibration.view_camera(v) for v in range(len(calibration.views))]
+        readings: dict[str, list[Reading]] = {
+            way: [READINGS[way](mesh, camera, settings.eta, settings.max_view_deg) for camera in cameras]
+            for way in ways
+        }
+    with stages.stage("samples"), StreamReader(capture) as stream:
+        stream.require_complete()
+        return take_samples(stream, calibration, mesh, readings, settings)
+
+
+def relight(models: dict[str, ReflectanceModel], request: Request, work: Path, stages: Stages) -> dict[str, float]:
+    """Relit images of every method, light and view; seconds per method beside what they share."""
+    first = next(iter(models.values()))
+    eta, mesh, lasers = first.eta, first.mesh, len(first.reflectance)
+    seconds = dict.fromkeys(models, 0.0)
+    with stages.stage("irradiance"):
+        fluxes = {light.name: transmitted_flux(light, mesh, eta, lasers) for light in request.relight.lights}
+    with stages.stage("relight"):
+        matrices = {v.name: view_matrix(mesh, PinholeCamera.from_config(v), eta) for v in request.relight.views}
+        for method, model in models.items():
+            start = time.perf_counter()
+            folder = work / "relit" / method
+            folder.mkdir(parents=True, exist_ok=True)
+            for light, flux in fluxes.items():
+                radiosity = model.radiosity(flux)
+                for view, matrix in matrices.items():
+                    np.save(folder / f"{light}@{view}.npy", matrix.image(radiosity))
+            seconds[method] = time.perf_counter() - start
+    return seconds
+
+
+def run(capture: Path, work: Path, request: Request) -> dict[str, Any]:
+    """Everything; returns what pipeline.json holds."""
+    stages, settings = Stages(), request.reconstruct
+    work.mkdir(parents=True, exist_ok=True)
+    with stages.stage("calibration"):
+        rig = read_json(capture / "rig.json", RigConfig, "repeat the capture command")
+        sensor = read_json(capture / "sensor.json", Sensor, "repeat the capture command")
+        mesh = read_scan(capture / "scan.ply")
+        calibration = nominal_calibration(rig, sensor)
+        calibration.save(work / "calibration.json")
+    samples, statistics = gather(capture, calibration, mesh, settings, stages)
+    if statistics.coverage == 0:
+        raise InputError("no camera sees any spot's surroundings", file=capture, remedy="check the cameras' poses")
+    save_samples(work / "samples.npz", samples["footprint"])
+    with stages.stage("distances"):
+        shared = samples["footprint"]  # the methods share its distances
+        log.info("%d near pairs", len(shared.spot_pairs.first) + len(shared.vertex_pairs.first))
+        left_out = omissions(shared, calibration)
+    models: dict[str, ReflectanceModel] = {}
+    seconds: dict[str, float] = {}
+    for name in settings.methods:
+        with stages.stage(f"reconstruct {name}"):
+            models[name] = reconstruct(samples[METHODS[name].reading], METHODS[name])
+            models[name].save(work / f"model-{name}.npz")
+        seconds[name] = stages.rows[-1]["seconds"]
+    relit = relight(models, request, work, stages)
+    result = {
+        "format_version": FORMAT_VERSION,
+        "stages": stages.rows,
+        "methods": {
+            name: {"seconds": seconds[name] + relit[name], "provenance": dict(models[name].provenance)}
+            for name in models
+        },
+        "capture": asdict(statistics),
+        "left_out": [item.row() for item in left_out],
+        "warnings": warnings_of(statistics),
+    }
+    write_json(work / "pipeline.json", result)
+    return result
+
+
+def warnings_of(statistics: SampleStatistics) -> list[str]:
+    """What a reader of the results should know about the data."""
+    out = [f"damaged and left out: {address}" for address in statistics.corrupt]
+    if statistics.spots_too_oblique:
+        out.append(f"{statistics.spots_too_oblique} of {statistics.spots} spots miss the scan or are too oblique")
+    if statistics.saturated_pixels:
+        out.append(f"{statistics.saturated_pixels} saturated pixels; the entries that they touch are left out")
+    return out
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """`python -m pipeline CAPTURE WORK --request FILE`; 0 on success, 2 after a one-line error."""
+    parser = argparse.ArgumentParser(prog="python -m pipeline", description="Reconstruct R_d from a capture, relight.")
+    parser.add_argument("capture", type=Path, help="folder with rig.json, sensor.json, scan.ply and the stream")
+    parser.add_argument("work", type=Path, help="folder to write into")
+    parser.add_argument("--request", type=Path, required=True, help="JSON: reconstruct, relight")
+    options = parser.parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(levelname)s %(name)s: %(message)s")
+    try:
+        request = read_json(options.request, Request, "write it as docs/conventions.md says")
+        run(options.capture, options.work, request)
+    except DiscoError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    return 0
