@@ -12,13 +12,16 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
 from twins import camera
 
+from disco_twin.light import sampling
 from disco_twin.light import transport as module
+from disco_twin.light.sampling import Rng
 from disco_twin.light.sources import BeamSource
 from disco_twin.light.transport import Traced, Transport
 from disco_twin.object.build import Boundary, Medium, TwinObject
@@ -103,6 +106,22 @@ def test_threads(usual: tuple[Transport, Traced], threads: int) -> None:
     for count in (1, 2, 5):
         dr.set_thread_count(count)
         assert_same(expected, trace(transport))
+
+
+def test_denormal_numbers_do_not_matter(threads: int) -> None:
+    """Worker threads flush denormal numbers to zero, the calling thread does not: the rare draw u = 0 must not show it.
+
+    Expected behaviour: a lobe direction drawn with u = 0 is the same in a small array (calling thread), in a large one
+    with one thread (the same) and in a large one with workers.
+    """
+    cosines = []
+    for count, size in ((1, 16), (1, 1 << 18), (2, 16), (2, 1 << 18)):
+        dr.set_thread_count(count)
+        rng = Rng(dr.zeros(mi.UInt32, size), dr.full(mi.UInt32, 5, size))
+        direction = sampling.von_mises_fisher(rng, mi.Vector3f(0.0, 0.0, 1.0), dr.opaque(mi.Float, 100.0))
+        cosines.append(float(direction.z[size // 2]))
+    assert 0 < cosines[0] < 0.2
+    assert cosines == [cosines[0]] * 4
 
 
 def test_company(usual: tuple[Transport, Traced]) -> None:
