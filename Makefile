@@ -41,7 +41,7 @@ validate: $(READY)
 	$(BIN)/python -m pytest -m "slow or not slow" --timeout 1800
 
 picture: $(READY)
-	$(BIN)/python -m disco_twin.report picture $(OUT) docs/picture.png
+	$(BIN)/python -m disco_twin.picture $(OUT) docs/picture.png
 
 clean:
 	rm -rf $(VENV) out build dist

@@ -26,6 +26,7 @@ def run(quick: bool = False) -> dict[str, Any]:
         opened = open_run(SCENE, Path(folder) / "run", "small" if quick else "full", "all", Console(stderr=True))
         summary = run_all(opened)
         took = json.loads((opened.folder.work / "pipeline.json").read_text())["methods"]
+    peaks = {row["name"]: row["peak_mb"] for row in summary["stages"]}
     curves = []
     for method in opened.methods:
         rows = [row for row in summary["relit"] if row["method"] == method]
@@ -33,7 +34,7 @@ def run(quick: bool = False) -> dict[str, Any]:
         variance = sum((row["nrmse"] * row["nrmse_se"] / max(abs(error), 1e-9) / len(rows)) ** 2 for row in rows)
         point = {
             "seconds": took[method]["seconds"],
-            "peak_mb": took[method]["peak_mb"],
+            "peak_mb": peaks[f"reconstruct {method}"],
             "error": error,
             "error_std": float(np.sqrt(variance)),
             "settings": {"scene": summary["scene"], "profile": "small" if quick else "full"},

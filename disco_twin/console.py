@@ -39,7 +39,10 @@ class SpeedColumn(ProgressColumn):
 
 @contextmanager
 def stage_bar(console: Console, name: str, unit: str) -> Iterator[Report]:
-    """A progress bar for a stage; gone when the stage has ended."""
+    """A progress bar for a stage; gone when the stage has ended. Nothing where there is no terminal to draw it on."""
+    if not console.is_terminal:
+        yield lambda done, total: None
+        return
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description:<12}"),

@@ -155,6 +155,24 @@ def impulse_figure(impulses: Sequence[Sequence[Impulse]]) -> Figure:
     return figure
 
 
+def picture_figure(spots: Sequence[Impulse], comparisons: Sequence[Comparison], method: str) -> Figure:
+    """The README's picture: two recorded spots on a log scale, then relit above reference for some lights."""
+    columns = 1 + len(comparisons)
+    figure, axes = new_figure(2.0 * columns, 2.85, nrows=2, ncols=columns)
+    for axis, spot, name in zip(axes[:, 0], spots, ("captured: one laser spot", "another (log scale)"), strict=False):
+        shown = np.log10(np.maximum(spot.radiance, spot.radiance.max() * 1e-5))
+        axis.imshow(shown, cmap="magma")
+        axis.set_title(name, loc="left", fontsize=8)
+    for column, row in zip(axes[:, 1:].T, comparisons, strict=True):
+        exposure = float(np.percentile(row.reference[:, row.mask], 99))
+        for axis, image, name in zip(column, (row.relit[method], row.reference), ("relit", "Mitsuba"), strict=True):
+            axis.imshow(tone(image, exposure, len(image)))
+            axis.set_title(f"{name}: {row.light}", loc="left", fontsize=8)
+    for axis in axes.flat:
+        plain(axis)
+    return figure
+
+
 def label_log_axis(axis: Any) -> None:
     """Plain numbers at 1, 2 and 5 of every decade."""
     axis.set_major_formatter(lambda v, _: f"{v:g}")

@@ -144,7 +144,8 @@ def _errors(data: ReportData) -> str:
     methods = list(dict.fromkeys(str(r["method"]) for r in relit))
     if not methods:
         return ""
-    points = {m: (data.seconds[m], rms(_nrmse(relit, m))) for m in methods if m in data.seconds}
+    errors = {m: rms(_nrmse(relit, m)) for m in methods}
+    points = {m: (data.seconds[m], e) for m, e in errors.items() if m in data.seconds and e > 0}
     pareto = _image(figures.pareto_figure(points), "error against time") if points else ""
     rows = []
     for light in dict.fromkeys(str(r["light"]) for r in relit):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from disco_twin.figures import Comparison, Impulse
 from disco_twin.folder import RunFolder
 from disco_twin.report import ReportData
-from disco_twin.score import load_reflectance, load_relit, load_scores
+from disco_twin.score import load_model, load_relit, load_scores
 from disco_twin.simulate import reference_path
 from disco_twin.world import World, mm_per_pixel
 
@@ -33,9 +33,9 @@ def collect(world: World, folder: RunFolder, summary: dict[str, Any]) -> ReportD
     distance = np.linalg.norm(points[truth.columns][:, None] - points[None], axis=2)
     models = {}
     for method in methods:
-        if (model := load_reflectance(folder, method)) is not None:
-            models[method] = np.asarray(model[0][:, truth.columns], np.float64)
-    seconds = json.loads((folder.work / "pipeline.json").read_text())["methods"]
+        if (model := load_model(folder, method)) is not None:
+            models[method] = np.asarray(model.reflectance[:, truth.columns], np.float64)
+    made = json.loads((folder.work / "pipeline.json").read_text())
     launched = truth.balance.launched
     return ReportData(
         summary=summary,
@@ -47,12 +47,12 @@ def collect(world: World, folder: RunFolder, summary: dict[str, Any]) -> ReportD
         truth=truth.mean,
         models=models,
         decades=load_scores(folder)["reflectance"],
-        seconds={name: float(entry["seconds"]) for name, entry in seconds.items()},
+        seconds={name: float(entry["seconds"]) for name, entry in made["methods"].items()},
         balance={
             term: list(getattr(truth.balance, term) / launched)
             for term in ("escaped", "absorbed", "reflected", "boundary", "inside")
         },
-        notes=notes(world),
+        notes=[*notes(world), *made["warnings"]],
     )
 
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from disco_twin.folder import RunFolder, write_atomically
 from disco_twin.simulate import reference_path
 from disco_twin.world import World
 from hw.errors import InputError
+
+if TYPE_CHECKING:
+    from pipeline.reconstruct.model import ReflectanceModel
 
 FORMAT_VERSION = 1
 F32 = NDArray[np.float32]
@@ -71,15 +74,11 @@ def load_relit(folder: RunFolder, method: str, light: str, view: str) -> F32:
     return np.asarray(np.load(path, allow_pickle=False))
 
 
-def load_reflectance(folder: RunFolder, method: str) -> tuple[F32, NDArray[np.bool_]] | None:
-    """R_d (L, V, V) in mm^-2 and which entries were measured (V, V); None if the method has no R_d (Lambertian)."""
-    path = folder.work / f"model-{method}.npz"
-    if not path.is_file():
-        return None
-    with np.load(path, allow_pickle=False) as data:
-        if "reflectance" not in data:
-            return None
-        return data["reflectance"], data["measured"]
+def load_model(folder: RunFolder, method: str) -> ReflectanceModel | None:
+    """A method's R_d; None for the Lambertian surface, whose light leaves where it enters."""
+    from pipeline.reconstruct.model import ReflectanceModel
+
+    return None if method == "lambertian" else ReflectanceModel.load(folder.work / f"model-{method}.npz")
 
 
 def score_models(folder: RunFolder, methods: Sequence[str]) -> dict[str, Any]:
@@ -90,10 +89,10 @@ def score_models(folder: RunFolder, methods: Sequence[str]) -> dict[str, Any]:
     truth = Truth.load(folder.twin / "truth.npz")
     out: dict[str, Any] = {}
     for method in methods:
-        model = load_reflectance(folder, method)
+        model = load_model(folder, method)
         if model is None:
             continue
-        estimate, measured = model[0][:, truth.columns], np.asarray(model[1])[..., truth.columns, :]
+        estimate, measured = model.reflectance[:, truth.columns], model.measured[truth.columns]
         own = score_reflectance(estimate, truth.mean, truth.standard_error, measured)
         full = score_reflectance(estimate, truth.mean, truth.standard_error, True)
         out[method] = {
