@@ -296,8 +296,8 @@ def layer(albedo: float, tau: float, cells: int = 400) -> tuple[float, float]:
 def test_plate_thinner_than_a_cell(depth: float) -> None:
     """A wide plate of 10 mean free paths a millimetre; a cell of the distance field measures a third of a millimetre.
 
-    Expected behaviour: reflection and transmission of the integral equation of radiative transfer. The thinnest plate is
-    but fifty times as deep as the offset that keeps rays off the surface they left.
+    Expected behaviour: reflection and transmission of the integral equation of radiative transfer. The thinnest plate
+    is but fifty times as deep as the offset that keeps rays off the surface they left.
     """
     transport = Transport(twin(block(40.0, depth), "matched", 1.0, 10.0, [0.9]))
     traced = transport.trace(beam(REPLICATES), REPLICATES, 60_000 if depth < 0.1 else 20_000, seed=57, deposit=True)

@@ -1,4 +1,4 @@
-"""Exact values of radiative transfer, on the path that users run: mesh objects, the photon walk, tallies and cameras."""
+"""Exact values of radiative transfer on the path that users run: mesh objects, the photon walk, tallies and cameras."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_half_space(n: float) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [1.0, 1.3, 1.5])
 def test_half_space_of_high_albedo(n: float) -> None:
-    """As above for albedo .9999, whose light spreads over 60 mean free paths; a deeper block, four times the photons."""
+    """As above for albedo .9999, whose light spreads over 60 free paths; a deeper block, eight times the photons."""
     transport = Transport(half_space(n, (0.999, 0.9999), width=400.0, depth=150.0))
     power, _ = escaped(transport, beam(REPLICATES), REPLICATES, 160_000, seed=12)
     assert_z(z_of_replicates(power, HALF_SPACE[n][2:]), f"n = {n}")

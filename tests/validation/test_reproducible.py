@@ -57,9 +57,8 @@ def spots(which: Sequence[int]) -> Any:
 
 def trace(transport: Transport, which: Sequence[int] = range(SPOTS), **key: Any) -> Traced:
     views = [camera((300.0, 0.0, 80.0), 14.0, 24), camera((-200.0, 100.0, 250.0), 14.0, 24)]
-    return transport.trace(
-        spots(which), len(which), WALKS, seed=61, streams=NAMES[list(which)], cameras=views, layers=2, deposit=True, **key
-    )
+    key |= {"streams": NAMES[list(which)], "cameras": views, "layers": 2, "deposit": True}
+    return transport.trace(spots(which), len(which), WALKS, seed=61, **key)
 
 
 def assert_same(a: Traced, b: Traced, part: slice | int = slice(None)) -> None:

@@ -1,0 +1,269 @@
+"""The estimators behind an image: connections, transmittance, projection, variance and the distance field."""
+
+from __future__ import annotations
+
+import math
+
+import gpytoolbox
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+from significance import assert_z, z_of_difference, z_of_replicates
+from test_samplers import streams
+from twins import beam, block, camera, pixel_areas, twin
+
+from disco_twin.light import walk as kernel
+from disco_twin.light.distance import build_distance_field, sample_surface
+from disco_twin.light.transport import Lobe, Transport, camera_table
+from disco_twin.object import shapes
+from disco_twin.object.build import Boundary, Medium, TwinObject
+from disco_twin.object.schema import Pebble
+from pipeline.calibrate.camera import PinholeCamera, look_at
+
+F64 = NDArray[np.float64]
+REPLICATES = 32
+
+
+def bumpy(kind: str = "rough", alpha: float = 0.3, g: float = 0.4) -> TwinObject:
+    """A body with dents, a heterogeneous medium and one wavelength; some 5 mm in radius."""
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
+    x, y, z = mesh.vertices.T
+    mesh.vertices *= (5 * (1 + 0.15 * np.sin(3 * x + 1) * np.cos(2.5 * y) + 0.1 * np.sin(4 * z)))[:, None]
+    low, high = np.asarray(mesh.bounds, float)
+    random = np.random.default_rng(1)
+    sigma_t = random.uniform(0.6, 3.0, (1, 5, 5, 5)).astype(np.float32)
+    albedo = random.uniform(0.9, 1.0, sigma_t.shape).astype(np.float32)
+    boundary = Boundary(kind, 1.0 if kind == "matched" else 1.3, alpha if kind == "rough" else 0.0)  # type: ignore[arg-type]
+    return TwinObject(mesh, boundary, Medium(sigma_t, albedo, low - 0.1, high + 0.1, (g,)))
+
+
+SPOT = {"origin": (46.0, 0.0, 20.0), "direction": (-0.917026, 0.0, -0.398707), "radius": 0.5}
+VIEWS = ((350.0, 0.0, 150.0), (100.0, 330.0, 100.0))  # from the spot's side, and across
+
+
+def blocks(images: F64, side: int) -> F64:
+    """(..., H, W) -> (..., H / side * W / side) sums over square blocks of pixels."""
+    *front, height, width = images.shape
+    cut = images.reshape(*front, height // side, side, width // side, side).sum(axis=(-3, -1))
+    return cut.reshape(*front, -1)
+
+
+@pytest.mark.parametrize("g", [0.0, 0.8])
+def test_lobe_connection_is_unbiased(g: float) -> None:
+    """Rationale: lobe connections and exits share each path by the balance heuristic; a density that is wrong, or used
+    in one technique only, moves energy.
+
+    Expected behaviour: with lobes, images equal those of plain exits (reach 0) in every block of pixels, in both
+    layers, in total, and the noise is lower.
+    """
+    obj = bumpy(g=g)
+    views = [camera(place, 13.0, 24) for place in VIEWS]
+    images = []
+    for lobe, walks in ((None, 2_000), (Lobe(100.0, 0.0, 0.0), 12_000)):
+        transport = Transport(obj, cells=64, lobe=lobe)
+        traced = transport.trace(beam(REPLICATES, **SPOT), REPLICATES, walks, seed=71, cameras=views, layers=2)
+        assert traced.images is not None
+        images.append(traced.images[:, :, :, 0].astype(float))
+    plain = images[1]
+    cut = [blocks(i, 6) for i in images]
+    busy = blocks((plain > 0).mean(axis=0), 6) > 4  # enough hits for a normal error
+    assert busy.sum() > 20
+    assert_z(z_of_difference(cut[0][:, busy], cut[1][:, busy]), f"blocks, g = {g}")
+    total = [i.sum(axis=(-1, -2)) for i in images]
+    assert_z(z_of_difference(*total), f"layers and cameras, g = {g}")
+    per_walk = [t[:, 0].var(axis=0, ddof=1) * n for t, n in zip(total, (2_000, 12_000), strict=True)]
+    assert np.all(per_walk[0] < per_walk[1] / 2)
+
+
+def test_cameras_see_what_leaves() -> None:
+    """Rationale: the known answers through a camera hold for a matched boundary; behind a rough one the connection goes
+    through refraction, factors of eta^2, shadowing and the lobe.
+
+    Expected behaviour: radiance over a half-space, times cosine, integrated over the hemisphere of directions by eight
+    distant cameras (Gauss-Legendre in the squared cosine), is the power that leaves by the walk's own tally.
+    """
+    x, w = np.polynomial.legendre.leggauss(8)
+    mu, w = np.sqrt((x + 1) / 2), w / 2
+    transport = Transport(twin(block(80.0, 20.0), "rough", 1.3, 10.0, [0.9, 0.99]))
+    turns = 2.4 * np.arange(len(mu))
+    places = 3000 * np.stack([np.sqrt(1 - mu**2) * np.cos(turns), np.sqrt(1 - mu**2) * np.sin(turns), mu], axis=1)
+    views = [camera(place, 40.0, 15) for place in places]
+    make = beam(REPLICATES, origin=(0.02, -0.01, 50.0))
+    traced = transport.trace(make, REPLICATES, 3_000, seed=72, cameras=views, layers=2, deposit=True)
+    assert traced.images is not None
+    assert traced.deposits is not None
+    area = np.stack([pixel_areas(view) for view in views])
+    seen = math.pi * np.einsum("c,tclhw,chw->tl", w, traced.images[:, 0].astype(float), area)
+    assert_z(z_of_replicates(seen - traced.deposits.sum(axis=2)), "seen - left")
+    assert np.all(seen.std(axis=0) / seen.mean(axis=0) / math.sqrt(REPLICATES) < 0.01)
+
+
+@pytest.mark.parametrize(("kind", "worst"), [("rough", 1.3), ("matched", 1.6)])
+def test_variance_images_are_calibrated(kind: str, worst: float) -> None:
+    """Rationale: the variance images keep Monte Carlo noise from being taken for sensor noise.
+
+    Expected behaviour: over 64 replicates the empirical variance is the estimated one in every decade of brightness,
+    or above it by what the estimate leaves out: splats of one photon into one pixel are correlated (stated bound).
+    """
+    transport = Transport(twin(trimesh.creation.icosphere(subdivisions=4, radius=5.0), kind, 1.3, 1.6, [0.99]))  # type: ignore[arg-type]
+    view = camera(VIEWS[0], 12.0, 48)
+    traced = transport.trace(beam(64, **SPOT), 64, 5_000, seed=73, cameras=[view])
+    assert traced.images is not None
+    assert traced.variance is not None
+    image, variance = traced.images[:, 0, 0, 0].astype(float), traced.variance[:, 0, 0, 0].astype(float)
+    mean, empirical, estimated = image.mean(axis=0), image.var(axis=0, ddof=1), variance.mean(axis=0)
+    for decade in range(4):
+        part = (mean <= mean.max() * 10.0**-decade) & (mean > mean.max() * 10.0 ** -(decade + 1))
+        if part.sum() < 30:
+            continue
+        ratio = (empirical[part] / mean[part] ** 2).sum() / (estimated[part] / mean[part] ** 2).sum()
+        spread = 3.5 * math.sqrt(2 / 63 / part.sum()) * 3  # heavier tails than Gaussian: three times its error
+        assert 1 - spread < ratio < worst, f"{kind}, decade {decade}: {ratio:.3f} of {part.sum()} pixels"
+
+
+def test_transmittance_is_unbiased() -> None:
+    """Rationale: ratio tracking through a grid of which one voxel is drawn per look-up.
+
+    Expected behaviour: its mean is exp(-integral of the trilinear sigma_t) by float64 quadrature, along 48 segments
+    that also leave the grid (clamped).
+    """
+    obj = bumpy()
+    tables = Transport(obj, cells=32)._tables((0,))
+    random = np.random.default_rng(4)
+    a = random.uniform(-6, 6, (48, 3))
+    b = a + random.uniform(-1, 1, (48, 3))  # short, or the mean is made by a few of the samples
+    n = 1 << 14
+    rng = streams(seed=9, n=48 * n)
+    start = mi.Point3f(np.repeat(a, n, axis=0).T.astype(np.float32))
+    direction, length = (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True), np.linalg.norm(b - a, axis=1)
+    value = kernel.transmittance(
+        tables, start, mi.Vector3f(np.repeat(direction, n, axis=0).T.astype(np.float32)),
+        mi.Float(np.repeat(length, n).astype(np.float32)), rng,
+    )  # fmt: skip
+    value = np.array(value, np.float64).reshape(48, n)
+    steps = (np.arange(4000) + 0.5) / 4000
+    exact = [
+        math.exp(-trilinear(obj.medium, obj.medium.sigma_t[0], p + (q - p) * steps[:, None]).mean() * s)
+        for p, q, s in zip(a, b, length, strict=True)
+    ]
+    assert_z((value.mean(axis=1) - exact) / (value.std(axis=1, ddof=1) / math.sqrt(n)), "segments")
+
+
+def trilinear(medium: Medium, values: NDArray[np.float32], points: F64) -> F64:
+    """(N,) values (nz, ny, nx) of cell centres interpolated at (N, 3) points, clamped at the rim; plain float64."""
+    shape = np.array(values.shape[::-1])
+    grid = (points - medium.low) / (np.asarray(medium.high) - medium.low) * shape - 0.5
+    base = np.floor(grid).astype(int)
+    part = grid - base
+    out = np.zeros(len(points))
+    for corner in np.ndindex(2, 2, 2):
+        index = np.clip(base + corner, 0, shape - 1)
+        weight = np.prod(np.where(np.array(corner) == 1, part, 1 - part), axis=1)
+        out += weight * values[index[:, 2], index[:, 1], index[:, 0]].astype(float)
+    return out
+
+
+def test_medium_is_trilinear_in_the_mean() -> None:
+    """The drawn voxel's sigma_t and sigma_s = albedo * sigma_t have the trilinear interpolants as their means."""
+    obj = bumpy()
+    tables = Transport(obj, cells=32)._tables((0,))
+    points = np.random.default_rng(5).uniform(-5.5, 5.5, (40, 3))
+    n = 1 << 14
+    chance, albedo = kernel.medium_at(
+        tables, mi.Point3f(np.repeat(points, n, axis=0).T.astype(np.float32)), streams(seed=10, n=40 * n)
+    )
+    sigma_t = np.array(chance, np.float64).reshape(40, n) * float(obj.medium.sigma_t.max())
+    sigma_s = sigma_t * np.array(albedo[0], np.float64).reshape(40, n)
+    for drawn, values in ((sigma_t, obj.medium.sigma_t[0]), (sigma_s, (obj.medium.sigma_t * obj.medium.albedo)[0])):
+        error = drawn.std(axis=1, ddof=1) / math.sqrt(n) + 1e-6  # in the clamped corners there is but one voxel
+        assert_z((drawn.mean(axis=1) - trilinear(obj.medium, values, points)) / error, "medium")
+
+
+def test_projection_is_the_cameras() -> None:
+    """Rationale: splats use the lens of the pipeline's camera, distortion included, and its pixels' solid angles.
+
+    Expected behaviour: pixel and visibility are those of `PinholeCamera.project`; the factor is one over distance^2
+    times the pixel's solid angle, which finite differences of that projection give in float64.
+    """
+    pose = look_at((300.0, 80.0, 120.0), (1.0, -2.0, 3.0))
+    view = PinholeCamera(
+        64, 40, np.array([420.0, 410.0]), np.array([31.0, 21.5]), np.array([-0.2, 0.1, 0.004, -0.003, 0.05]), pose
+    )
+    points = np.random.default_rng(6).uniform(-28, 28, (20_000, 3))
+    table = camera_table([view])
+    _, towards, pixel, factor, inside = kernel.project(table, mi.UInt32(0), mi.Point3f(points.T.astype(np.float32)))
+    where, depth = view.project(points)
+    expected = (where >= 0).all(axis=1) & (where < [64, 40]).all(axis=1) & (depth > 0)
+    near = np.abs(where - np.round(where)).min(axis=1) < 1e-3  # a pixel's edge: single precision decides
+    visible = np.array(inside)
+    assert np.array_equal(visible[~near], expected[~near])
+    assert 1000 < visible.sum() < 19_000
+    used = visible & expected & ~near
+    index = np.floor(where[used]).astype(int)
+    assert np.array_equal(np.array(pixel)[used], index[:, 1] * 64 + index[:, 0])
+    offset = view.position - points
+    squared = (offset**2).sum(axis=1)
+    assert np.abs(np.array(towards).T - offset / np.sqrt(squared)[:, None]).max() < 1e-6
+    unit = offset / np.sqrt(squared)[:, None]
+    side = np.cross(unit, [0.3, 0.5, 0.8])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    up = np.cross(unit, side)
+    step = 1e-3
+    da, db = (view.project(points + step * s)[0] - view.project(points - step * s)[0] for s in (side, up))
+    # Pixels per square millimetre across the line of sight.
+    exact = np.abs(da[:, 0] * db[:, 1] - da[:, 1] * db[:, 0]) / (2 * step) ** 2
+    assert np.abs(np.array(factor)[used] / exact[used] - 1).max() < 1e-3
+
+
+SURFACES = {
+    "pebble": lambda: shapes.pebble(Pebble(kind="pebble")),
+    "plate": lambda: trimesh.creation.box(extents=[30.0, 20.0, 0.05]),
+    "torus": lambda: trimesh.creation.torus(5.0, 2.0, major_sections=48, minor_sections=24),
+    "soup": lambda: trimesh.Trimesh(
+        np.random.default_rng(8).normal(size=(90, 3)) * [9.0, 3.0, 1.0], np.arange(90).reshape(30, 3), process=False
+    ),
+}
+
+
+@pytest.mark.parametrize("surface", sorted(SURFACES))
+def test_distance_field_is_a_lower_bound(surface: str) -> None:
+    """Rationale: a flight is not tested against the surface if the field vouches for it; one cell that claims too much
+    lets light through walls.
+
+    Expected behaviour: at points anywhere, next to the surface, and outside the grid, the field's value is at most the
+    exact distance, and at least that less four cells (or zero), so it is of use.
+    """
+    mesh = SURFACES[surface]()
+    field = build_distance_field(mesh, 64)
+    random = np.random.default_rng(9)
+    low, high = np.asarray(mesh.bounds, float)
+    reach = field.cell * field.cells / 2
+    everywhere = (low + high) / 2 + random.uniform(-1.1 * reach, 1.1 * reach, (20_000, 3))
+    samples, _ = sample_surface(mesh, 4 * field.cell)
+    pick = random.integers(len(samples), size=20_000)
+    beside = samples[pick] + random.normal(size=(20_000, 3)) * random.choice([0.01, 0.5, 2.0], (20_000, 1)) * field.cell
+    points = np.concatenate([everywhere, beside])
+    corners, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32)
+    exact = np.sqrt(gpytoolbox.squared_distance(points, corners, faces, use_cpp=True)[0])
+    index = np.clip(np.floor((points - field.low) / field.cell).astype(int), 0, field.cells - 1)
+    value = field.distance[index[:, 2], index[:, 1], index[:, 0]].astype(float)
+    assert np.all(value <= exact + 1e-6 * field.cell), f"{np.max(value - exact):.3g} mm too much"
+    covered = (np.abs(points - (low + high) / 2) < reach - field.cell).all(axis=1)
+    assert np.all(value[covered] >= exact[covered] - 4 * field.cell)
+
+
+@pytest.mark.parametrize("surface", ["torus", "soup"])
+def test_surface_samples_leave_no_gap(surface: str) -> None:
+    """No point of the surface is farther than the spacing from a sample of its own face."""
+    mesh = SURFACES[surface]()
+    spacing = 0.4
+    samples, faces = sample_surface(mesh, spacing)
+    random = np.random.default_rng(10)
+    for face in random.integers(len(mesh.faces), size=60):
+        b = random.dirichlet([1.0, 1.0, 1.0], 200)
+        points = b @ np.asarray(mesh.triangles[face], float)
+        own = samples[faces == face]
+        nearest = np.linalg.norm(points[:, None] - own[None], axis=2).min(axis=1)
+        assert nearest.max() <= spacing
