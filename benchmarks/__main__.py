@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from disco_twin.resources import measured, usable_cores
+from pipeline.resources import measured, usable_cores
 
 REGISTRY = {
     "irradiance": "benchmarks.irradiance",

@@ -11,7 +11,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from disco_twin.resources import total_memory_gb, usable_cores
+from pipeline.resources import total_memory_gb, usable_cores
 
 PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "trimesh", "embreex", "pydantic", "matplotlib", "OpenEXR")
 RENDER_TIMEOUT_S = 120.0

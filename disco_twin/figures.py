@@ -100,7 +100,7 @@ class Comparison:
 def comparison_figure(rows: Sequence[Comparison], shown: Sequence[str]) -> Figure:
     """One light: for each view the relit images, the reference and the differences, with scale bars."""
     columns = len(shown) * 2 + 1
-    figure, axes = new_figure(2.55 * columns, 1.72 * len(rows) + 0.25, nrows=len(rows), ncols=columns, squeeze=False)
+    figure, axes = new_figure(3.3 * columns, 2.2 * len(rows), nrows=len(rows), ncols=columns, squeeze=False)
     for line, row in zip(axes, rows, strict=True):
         lasers, height, _ = row.reference.shape
         exposure = float(np.percentile(row.reference[:, row.mask], 99)) if row.mask.any() else 1.0
@@ -108,13 +108,13 @@ def comparison_figure(rows: Sequence[Comparison], shown: Sequence[str]) -> Figur
         pictures = [(m, row.relit[m]) for m in shown] + [("reference", row.reference)]
         for axis, (name, image) in zip(line, pictures, strict=False):
             axis.imshow(tone(image, exposure, lasers), interpolation="nearest")
-            note = f"   nrmse {row.nrmse[name]:.3f}" if name in row.nrmse else f"   {row.view}"
-            axis.set_title(name + note, loc="left", fontsize=8)
+            note = f", nrmse {row.nrmse[name]:.3f}" if name in row.nrmse else ""
+            axis.set_title(f"{row.view}: {name}{note}", loc="left", fontsize=8)
         scale_bar(line[0], row.mm_per_pixel, height)
         for axis, name in zip(line[len(pictures) :], shown, strict=True):
             difference = np.where(row.mask, (row.relit[name] - row.reference).mean(axis=0) / exposure, np.nan)
             drawn = axis.imshow(difference, cmap="RdBu_r", vmin=-DIFFERENCE_SPAN, vmax=DIFFERENCE_SPAN)
-            axis.set_title(f"{name} - reference", loc="left", fontsize=8)
+            axis.set_title(f"{row.view}: {name} minus reference", loc="left", fontsize=8)
         for axis in line:
             plain(axis)
         bar = figure.colorbar(drawn, ax=line, fraction=0.02, pad=0.01, shrink=0.85)

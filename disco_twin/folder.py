@@ -15,8 +15,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from disco_twin.resources import measured
 from hw.errors import InputError
+from pipeline.resources import measured
 
 FORMAT_VERSION = 1
 

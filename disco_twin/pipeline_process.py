@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from disco_twin.folder import RunFolder, write_atomically
-from disco_twin.resources import wait_for
 from disco_twin.scene import Scene
 from hw.errors import DiscoError
 
@@ -29,7 +28,10 @@ def pipeline_inputs(scene: Scene, methods: Sequence[str]) -> dict[str, Any]:
 
 
 def reconstruct_apart(scene: Scene, folder: RunFolder, methods: Sequence[str]) -> float:
-    """Run `python -m pipeline` on the capture; its peak memory in MiB. Its messages go to OUT/work/pipeline.log."""
+    """Run `python -m pipeline` on the capture; its peak memory in MiB. Its messages go to OUT/work/pipeline.log.
+
+    The peak is the process's own word: `wait4` would count what our process held when it started the child.
+    """
     request = folder.work / "request.json"
     write_atomically(request, json.dumps(pipeline_inputs(scene, methods), indent=1).encode())
     command = [sys.executable, "-m", "pipeline", str(folder.capture), str(folder.work), "--request", str(request)]
@@ -37,15 +39,15 @@ def reconstruct_apart(scene: Scene, folder: RunFolder, methods: Sequence[str]) -
         with (folder.work / "pipeline.log").open("w") as log:
             child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=errors)
             try:
-                status, peak_mb = wait_for(child.pid)
+                status = child.wait()
             except BaseException:
                 child.terminate()
                 child.wait()
                 raise
-            child.returncode = status
         errors.seek(0)
         said = errors.read().strip().splitlines()
     if status != 0:
         why = said[-1] if said else f"ended with status {status}"
         raise PipelineFailed(why if status == 2 else f"the pipeline failed: {why}")
-    return peak_mb
+    made = json.loads((folder.work / "pipeline.json").read_text())
+    return max(float(row["peak_mb"]) for row in made["stages"])

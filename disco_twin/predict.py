@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from disco_twin.resources import usable_cores
 from disco_twin.world import World, left_out_by_the_twin
+from pipeline.resources import usable_cores
 
 # Measured on quick.toml (alpha .3, mean free path about 1.7 mm), per core and second; other media scale with the
 # number of collisions, so this is a guess within a factor of two or three.

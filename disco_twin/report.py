@@ -59,6 +59,7 @@ class ReportData:
     distance: (n, V) mm from the truth columns' vertices; truth: (L, n, V); models: the same by method, mm^-2
     decades: by method, the log10 rmse of "measured" and of all ("completed") entries and the "coverage" by decade
     seconds: reconstruction and relighting of each method; balance: term -> share of the launched power per wavelength
+    imbalance: largest departure of their sum from one, roulette included
     """
 
     summary: Summary
@@ -72,6 +73,7 @@ class ReportData:
     decades: Mapping[str, Mapping[str, Mapping[str, float | None]]] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
     balance: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    imbalance: float = 0.0
     notes: Sequence[str] = ()
 
 
@@ -202,6 +204,10 @@ def _costs(data: ReportData) -> str:
     parts = [_image(figures.stage_figure(data.summary["stages"]), "time and memory per stage")]
     if data.balance:
         parts.append("<h3>Energy balance of the ground truth</h3>")
+        parts.append(
+            "<p>Launched over the truth's columns and where it went; <i>boundary</i> is the rough boundary's own loss "
+            f"(it scatters once only). The terms add up to one within {data.imbalance:.1e}.</p>"
+        )
         parts.append(_image(figures.balance_figure(data.balance, data.wavelengths_nm), "energy balance"))
     text = "Every stage with its own wall-clock time and peak memory."
     return _section("Time, memory and energy", text, "".join(parts))

@@ -52,6 +52,7 @@ def collect(world: World, folder: RunFolder, summary: dict[str, Any]) -> ReportD
             term: list(getattr(truth.balance, term) / launched)
             for term in ("escaped", "absorbed", "reflected", "boundary", "inside")
         },
+        imbalance=float(np.abs(truth.balance.residual).max()),
         notes=[*notes(world), *made["warnings"]],
     )
 

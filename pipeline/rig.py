@@ -94,6 +94,6 @@ class RigConfig(Strict):
         names = [c.name for c in self.cameras]
         if len(set(names)) < len(names):
             raise ValueError("camera names must be distinct")
-        if len(set(a % 360 for a in self.turntable_angles_deg)) < len(self.turntable_angles_deg):
+        if len({a % 360 for a in self.turntable_angles_deg}) < len(self.turntable_angles_deg):
             raise ValueError("turntable angles must be distinct")
         return self

@@ -13,7 +13,6 @@ import argparse
 import json
 import logging
 import os
-import resource
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -41,6 +40,7 @@ from pipeline.reconstruct.views import Reading
 from pipeline.relight.irradiance import transmitted_flux
 from pipeline.relight.lights import Light
 from pipeline.relight.relight import view_matrix
+from pipeline.resources import measured
 from pipeline.rig import CameraConfig, RigConfig
 
 FORMAT_VERSION = 1
@@ -66,17 +66,16 @@ class Request(Strict):
 
 @dataclass
 class Stages:
-    """What every stage took, in order: name, seconds, peak resident memory in MiB (of the process so far)."""
+    """What every stage took, in order: name, seconds, peak resident memory in MiB."""
 
     rows: list[dict[str, Any]] = field(default_factory=list)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Measure a block."""
-        start = time.perf_counter()
-        yield
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
-        self.rows.append({"name": name, "seconds": time.perf_counter() - start, "peak_mb": peak})
+        with measured() as usage:
+            yield
+        self.rows.append({"name": name, "seconds": usage.seconds, "peak_mb": usage.peak_mb})
         log.info("%s: %.1f s", name, self.rows[-1]["seconds"])
 
 

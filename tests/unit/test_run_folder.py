@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from disco_twin.folder import RunFolder, content_key, write_atomically
-from disco_twin.resources import measured, usable_cores
 from hw.errors import InputError
+from pipeline.resources import measured, usable_cores
 
 
 @pytest.fixture

@@ -54,12 +54,6 @@ def peak_memory_mb() -> float:
     return _maxrss_mb(resource.getrusage(resource.RUSAGE_SELF))
 
 
-def wait_for(pid: int) -> tuple[int, float]:
-    """Wait for a child process: its exit status (negative: the signal that ended it) and its peak memory in MiB."""
-    _, status, usage = os.wait4(pid, 0)
-    return os.waitstatus_to_exitcode(status), _maxrss_mb(usage)
-
-
 def _maxrss_mb(usage: resource.struct_rusage) -> float:
     """`ru_maxrss` is in bytes on macOS and in KiB elsewhere."""
     return usage.ru_maxrss / (MIB if sys.platform == "darwin" else 1024.0)
