@@ -1,4 +1,4 @@
-"""An object of ours as a stock Mitsuba scene for `volpath`: the outside renderer that tests and benchmarks compare with."""
+"""An object of ours as a stock Mitsuba scene for `volpath`, the outside renderer of tests and benchmarks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DEPTH = 4000  # Russian roulette starts here, that is, never: volpath caps survi
 
 
 def volpath_scene(obj: TwinObject, camera: PinholeCamera, light: Directional | Uniform, folder: Path) -> Any:
-    """A Mitsuba scene of the object (laser 0), one undistorted camera and one emitter; the mesh is written to `folder`."""
+    """The object (laser 0), one undistorted camera and one emitter; the mesh is written to `folder`."""
     path = folder / "object.ply"
     obj.mesh.export(path, vertex_normal=False)
     medium, eta = obj.medium, obj.boundary.eta
@@ -25,7 +25,8 @@ def volpath_scene(obj: TwinObject, camera: PinholeCamera, light: Directional | U
 
     def volume(values: NDArray[np.float32]) -> dict[str, Any]:
         grid = mi.VolumeGrid(np.ascontiguousarray(values[..., None], np.float32))
-        return {"type": "gridvolume", "grid": grid, "to_world": to_world, "filter_type": "trilinear", "wrap_mode": "clamp"}
+        look_up = {"filter_type": "trilinear", "wrap_mode": "clamp"}
+        return {"type": "gridvolume", "grid": grid, "to_world": to_world, **look_up}
 
     rough = {
         "type": "roughdielectric", "int_ior": eta, "ext_ior": 1.0, "alpha": obj.boundary.alpha, "distribution": "ggx",

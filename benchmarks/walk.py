@@ -41,7 +41,8 @@ def run(quick: bool = False) -> dict[str, Any]:
     lobe = Lobe.of(obj.medium)
     plain = replace(lobe, reach=0.0)
     curves = spot_curves(Transport(obj), Transport(obj, lobe=plain), scene.rig, sizes, 3 if quick else 5)
-    return {"name": "walk", "quick": quick, "triangles": len(obj.mesh.faces), **throughput(obj, quick), "curves": curves}
+    rates = throughput(obj, quick)
+    return {"name": "walk", "quick": quick, "triangles": len(obj.mesh.faces), **rates, "curves": curves}
 
 
 def spot_curves(lobed: Any, plain: Any, rig: Any, sizes: Sequence[int], repetitions: int) -> list[dict[str, Any]]:
@@ -66,7 +67,7 @@ def spot_curves(lobed: Any, plain: Any, rig: Any, sizes: Sequence[int], repetiti
         return np.asarray(cut.reshape(shape).mean(axis=(-3, -1)))
 
     references = [response(lobed, 4 * max(sizes), seed) for seed in (1, 2)]
-    truth = sum(references) / 2
+    truth = np.mean(references, axis=0)
     noise = ((references[0] - references[1]) ** 2) / 4
     decade = np.floor(-np.log10(np.maximum(truth, 1e-30) / truth.max(axis=(1, 3, 4), keepdims=True)))
     estimators: dict[str, Any] = {"lobe": lobed, "plain": plain}

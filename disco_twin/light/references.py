@@ -89,7 +89,8 @@ def load_reference(path: Path) -> Reference:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             header, channels = dict(file.header()), {name: c.pixels for name, c in file.channels().items()}
     except (OSError, RuntimeError) as error:
-        raise InputError(f"not a readable EXR ({error})", file=path, remedy="delete it, it is rendered again") from error
+        remedy = "delete it, it is rendered again"
+        raise InputError(f"not a readable EXR ({error})", file=path, remedy=remedy) from error
     if header.get("formatVersion") != FORMAT_VERSION:
         raise InputError("not a reference of this format", file=path, remedy="delete it, it is rendered again")
     lasers = len(channels) // (len(HALVES) * len(LAYERS))

@@ -39,7 +39,7 @@ def opaque3(kind: Any, values: Any) -> Any:
 
 
 class Source(Protocol):
-    """Starts photons. See the module's docstring. `scale` is the usual weight of one, which sets the counts' quantum."""
+    """Starts photons (see above). `scale` is the usual weight of one, which sets the counts' quantum."""
 
     scale: float
 

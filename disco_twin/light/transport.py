@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_twin.light import walk as kernel
+from disco_twin.light import tables as kernel
 from disco_twin.light.balance import EnergyBalance
 from disco_twin.light.distance import build_distance_field
 from disco_twin.light.sources import Source, opaque3, to_float, weight_type
+from disco_twin.light.walk import Balance, walk
 from disco_twin.object.build import Medium, TwinObject
 from pipeline.calibrate.camera import PinholeCamera
 
@@ -69,19 +71,19 @@ class Transport:
         self.radius = float(np.linalg.norm(self.vertices, axis=1).max()) * 1.001
         self.lasers = len(obj.medium.sigma_t)
         self.groups = wavelength_groups(obj.medium)
-        boundary = {
+        bsdfs: dict[str, dict[str, Any]] = {
             "rough": {
                 "type": "roughdielectric", "int_ior": obj.boundary.eta, "ext_ior": 1.0,
                 "alpha": obj.boundary.alpha, "distribution": "ggx",
             },
             "smooth": {"type": "dielectric", "int_ior": obj.boundary.eta, "ext_ior": 1.0},
             "matched": {"type": "null"},
-        }[obj.boundary.kind]  # fmt: skip
-        self.scene = mesh_scene(self.vertices, self.faces, boundary)
+        }  # fmt: skip
+        self.scene = mesh_scene(self.vertices, self.faces, bsdfs[obj.boundary.kind])
         self._cells = cells
 
     @cached_property
-    def _shared(self) -> dict[str, object]:
+    def _shared(self) -> dict[str, Any]:
         """Tables that do not depend on the wavelength."""
         field = build_distance_field(self.object.mesh, self._cells)
         return dict(
@@ -134,7 +136,7 @@ class Transport:
 
     def trace(
         self,
-        make_source: object,
+        make_source: Callable[[Sequence[int]], Source],
         tags: int,
         walks: int,
         *,
@@ -153,12 +155,14 @@ class Transport:
         """
         streams = np.arange(tags, dtype=np.uint32) if streams is None else streams.astype(np.uint32)
         parts = [
-            self._trace_group(make_source(group), group, tags, walks, seed, streams, cameras, layers, deposit, first, lanes)
+            self._trace_group(
+                make_source(group), group, tags, walks, seed, streams, cameras, layers, deposit, first, lanes
+            )
             for group in self.groups
         ]
         order = np.argsort([laser for group in self.groups for laser in group])
 
-        def join(name: str, axis: int) -> NDArray[np.float64] | None:
+        def join(name: str, axis: int) -> Any:
             values = [getattr(p, name) for p in parts]
             if values[0] is None:
                 return None
@@ -184,7 +188,7 @@ class Transport:
         )
         batch = max(1, min(tags, ACCUMULATOR_BYTES // max(per_tag, 1), (1 << 31) // max(walks, 1)))
         names = mi.UInt32(streams)
-        total = {name: np.zeros(len(group)) for name in kernel.Balance.__dataclass_fields__}
+        total = {name: np.zeros(len(group)) for name in Balance.__dataclass_fields__}
         images, variances, deposits = [], [], []
         for low in range(0, tags, batch):
             n = min(batch, tags - low)
@@ -194,7 +198,7 @@ class Transport:
             step = max(1, min(walks, PHOTONS_PER_CALL // n))
             for start in range(0, walks, step):
                 m = min(step, walks - start)
-                balance = kernel.walk(
+                balance = walk(
                     tables, source, table, pictures, powers, dr.opaque(mi.UInt32, n * m), dr.opaque(mi.UInt32, m),
                     dr.opaque(mi.UInt32, first + start), dr.opaque(mi.UInt32, low), names,
                     dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), lanes,
@@ -232,7 +236,7 @@ def wavelength_groups(medium: Medium) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(g) for g in groups)
 
 
-def mesh_scene(vertices: F64, faces: NDArray[np.int64], bsdf: dict[str, object]) -> mi.Scene:
+def mesh_scene(vertices: F64, faces: NDArray[np.int64], bsdf: dict[str, Any]) -> mi.Scene:
     """A Mitsuba scene of one mesh with flat (geometric) normals: exact reciprocity, no weight lost to shading."""
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf)
@@ -256,7 +260,7 @@ def camera_table(cameras: Sequence[PinholeCamera]) -> kernel.Cameras:
 
 
 def new_images(cameras: Sequence[PinholeCamera], layers: int, size: int, weight: float) -> kernel.Images:
-    """Zeroed accumulators. The quantum is 2^-24 of the radiance that a photon of that weight adds at the nearest camera."""
+    """Zeroed accumulators. The quantum is 2^-24 of what a photon of that weight adds at the nearest camera."""
     unit = weight * max(float(c.focal.prod() / (c.position @ c.position)) for c in cameras)
     quantum = 2.0 ** (np.floor(np.log2(unit)) - 24)
     quantum_squared = 2.0 ** (2 * np.floor(np.log2(unit)) - 24)

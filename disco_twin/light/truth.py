@@ -7,6 +7,7 @@ function of vertex v: cosine in, cosine out, which is what is reciprocal.
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -86,10 +87,11 @@ def truth_columns(
 
     hats = np.repeat(basis[:, columns].toarray().T, REPLICATES, axis=0)
 
-    def source(group: object) -> HatSource:
-        return HatSource(transport.vertices, transport.faces, hats, len(group))  # type: ignore[arg-type]
+    def source(group: Sequence[int]) -> HatSource:
+        return HatSource(transport.vertices, transport.faces, hats, len(group))
 
-    names = (np.repeat(columns, REPLICATES) * REPLICATES + np.tile(np.arange(REPLICATES), len(columns))).astype(np.uint32)
+    replicate = np.tile(np.arange(REPLICATES), len(columns))
+    names = (np.repeat(columns, REPLICATES) * REPLICATES + replicate).astype(np.uint32)
     per_replicate = max(1, round(walks / REPLICATES))
     traced = transport.trace(source, len(hats), per_replicate, seed=seed, streams=names, deposit=True)
     assert traced.deposits is not None

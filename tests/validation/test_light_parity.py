@@ -74,7 +74,7 @@ def test_photons_and_quadrature_agree(name: str) -> None:
     assert abs(total.mean() / ours.sum() - 1) < 1e-3 + 4 * total.std(ddof=1) / 4 / ours.sum()
 
 
-@pytest.mark.parametrize("light", [Uniform(), Directional(direction=(-0.4, -0.8, -0.3))], ids=["uniform", "directional"])
+@pytest.mark.parametrize("light", [Uniform(), Directional(direction=(-0.4, -0.8, -0.3))], ids=lambda light: light.name)
 def test_agrees_with_mitsubas_own_emitters(light: Light) -> None:
     """Expected: Mitsuba's direct illumination of a white Lambertian surface, times pi, is our irradiance."""
     mesh = dented()

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from benchmarks.volpath import volpath_scene
 from disco_twin.light.references import render_reference
 from disco_twin.light.transport import Transport
 from disco_twin.object.build import Boundary, Medium, TwinObject
-from benchmarks.volpath import volpath_scene
 from pipeline.calibrate.camera import PinholeCamera, look_at
 from pipeline.relight.lights import Directional, Uniform
 from tests.validation.significance import assert_z, z_of_difference

@@ -1,0 +1,211 @@
+"""Connections of photons to the cameras: through the boundary's BSDF at exits, by lobes from below the surface.
+
+Seen from inside, the directions that refract towards a camera fill a narrow lobe, so few exits point there. A collision
+near the surface therefore sends an extra flight into a von Mises-Fisher lobe about that direction; its contribution
+and that of ordinary exits are combined by the balance heuristic (Veach 1997, section 9.2.2). Across an index-matched
+boundary the connection is straight instead.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from disco_twin.light import sampling
+from disco_twin.light.sampling import Rng
+from disco_twin.light.tables import FAR, ROW, Cameras, Images, Tables, cell_index, medium_at
+
+
+def refracted_axis(t: Tables, normal: Any, towards: Any) -> Any:
+    """Inside direction that a smooth boundary refracts into `towards` (Snell), the lobe's axis."""
+    tangent = (towards - normal * dr.dot(normal, towards)) * (1.0 / t.eta)
+    return dr.normalize(tangent + normal * dr.safe_sqrt(1.0 - dr.squared_norm(tangent)))
+
+
+def lobe_density(t: Tables, q: Any, direction: Any, target: Any) -> tuple[Any, Any, Any]:
+    """Axis of the lobe at collision q towards `target`, its density at `direction`, and whether it is used there."""
+    index = cell_index(t, q)
+    normal = dr.gather(mi.Vector3f, t.normal, index)
+    towards = dr.normalize(target - q)
+    usable = (dr.dot(normal, towards) > -0.1) & (dr.squared_norm(normal) > 0.5)
+    axis = refracted_axis(t, normal, towards)
+    return axis, sampling.von_mises_fisher_pdf(dr.dot(axis, direction), t.kappa), usable
+
+
+@dr.syntax
+def transmittance(t: Tables, origin: Any, direction: Any, length: Any, rng: Rng) -> tuple[Any, Rng]:
+    """Unbiased transmittance along a segment inside the medium: exact, or by ratio tracking (Novak et al. 2014).
+
+    Returns the generator too, as everything here does: Dr.Jit's branches replace the objects that they change.
+    """
+    result = mi.Float(1.0)
+    if dr.hint(t.homogeneous, mode="scalar"):
+        result = dr.exp(-t.majorant * length)
+    else:
+        travelled = mi.Float(0.0)
+        going = mi.Bool(True)
+        while dr.hint(going, label="transmittance"):
+            travelled += sampling.exponential(rng) / t.majorant
+            going = travelled < length
+            if dr.hint(going):
+                real, _ = medium_at(t, dr.fma(direction, travelled, origin), rng)
+                result *= 1.0 - real
+    return result, rng
+
+
+def project(cams: Cameras, camera: Any, point: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """Direction and distance from a point to a camera, pixel index, the factor 1 / (distance^2 * pixel solid angle)
+    that turns intensity into pixel radiance, and whether it falls on the sensor.
+    """
+    base = camera * ROW
+    read = [dr.gather(mi.Float, cams.rows, base + k) for k in range(ROW)]
+    position = mi.Point3f(*read[0:3])
+    right, down, forward = mi.Vector3f(*read[3:6]), mi.Vector3f(*read[6:9]), mi.Vector3f(*read[9:12])
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = read[12:21]
+    towards = position - point
+    squared = dr.squared_norm(towards)
+    towards = towards * dr.rsqrt(squared)
+    cosine = -dr.dot(towards, forward)
+    x, y = -dr.dot(towards, right) / cosine, -dr.dot(towards, down) / cosine
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
+    dxx = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+    dxy = x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
+    dyy = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+    jacobian = dxx * dyy - dxy * dxy
+    u = (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)) * fx + cx
+    v = (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y) * fy + cy
+    inside = (cosine > 0.0) & (jacobian > 0.0) & (u >= 0.0) & (v >= 0.0) & (u < cams.width) & (v < cams.height)
+    pixel = mi.UInt32(v) * cams.width + mi.UInt32(u)
+    factor = fx * fy * jacobian / (squared * cosine * cosine * cosine)
+    return position, towards, pixel, factor, inside
+
+
+def splat(
+    total: Any, squared: Any, images: Images, base: Any, stride: int, value: Any, lasers: int, rng: Rng, ok: Any
+) -> None:
+    """Add a contribution per wavelength, stochastically rounded to whole quanta."""
+    dither = rng.next()
+    for k in range(lasers):
+        v = dr.select(ok, value[k], 0.0)
+        count = mi.UInt64(v * images.inverse_quantum + dither)
+        square = mi.UInt64(v * v * images.inverse_quantum_squared + dither)
+        dr.scatter_add(total, count, base + k * stride, ok)
+        dr.scatter_add(squared, square, base + k * stride, ok)
+
+
+@dr.syntax
+def straight_transmittance(t: Tables, origin: Any, target: Any, rng: Rng) -> tuple[Any, Rng]:
+    """Transmittance from a collision straight to a camera through an index-matched boundary, cavities included."""
+    direction = target - origin
+    length = dr.norm(direction)
+    direction = direction / length
+    result = mi.Float(1.0)
+    inside = mi.Bool(True)
+    p = mi.Point3f(origin)
+    going = mi.Bool(True)
+    while dr.hint(going, label="straight"):
+        hit = t.scene.ray_intersect(
+            mi.Ray3f(p, direction, FAR, 0.0, mi.Color0f()), mi.RayFlags.Minimal, False, True
+        )
+        going = hit.is_valid()
+        if dr.hint(going & inside):
+            passed, rng = transmittance(t, p, direction, hit.t, rng)
+            result *= passed
+        going &= result > 0.0
+        if dr.hint(going):
+            outward = dr.dot(hit.n, direction) > 0.0
+            inside = ~outward
+            p = mi.Point3f(hit.p + hit.n * dr.select(outward, t.lift, -t.lift))
+    return result, rng
+
+
+@dr.syntax
+def connect_lobes(
+    t: Tables, cams: Cameras, images: Images, tag: Any, point: Any, before: Any, weight: Any, rng: Rng
+) -> Rng:
+    """Connect one drawn collision to every camera. `before` is the flight's direction before the collision."""
+    pixels = cams.width * cams.height
+    context = mi.BSDFContext(mi.TransportMode.Importance)
+    camera = mi.UInt32(0)
+    while dr.hint(camera < cams.count, label="lobes"):
+        base = (tag * (images.layers * cams.count) + camera) * (t.lasers * pixels)
+        if dr.hint(t.matched, mode="scalar"):
+            position, towards, pixel, factor, seen = project(cams, camera, point)
+            if dr.hint(seen):
+                through, rng = straight_transmittance(t, point, position, rng)
+                phase = sampling.henyey_greenstein_pdf(dr.dot(before, towards), t.g)
+                splat(
+                    images.lobes, images.lobes_squared, images, base + pixel, pixels,
+                    weight * (phase * through * factor), t.lasers, rng, through > 0.0,
+                )  # fmt: skip
+        else:
+            row = camera * ROW
+            eye = mi.Point3f(*[dr.gather(mi.Float, cams.rows, row + k) for k in range(3)])
+            axis, _, usable = lobe_density(t, point, before, eye)
+            if dr.hint(usable):
+                kappa = t.kappa
+                omega = sampling.von_mises_fisher(rng, axis, kappa)
+                lobe = sampling.von_mises_fisher_pdf(dr.dot(axis, omega), kappa)
+                phase = sampling.henyey_greenstein_pdf(dr.dot(before, omega), t.g)
+                hit = t.scene.ray_intersect(
+                    mi.Ray3f(point, omega, t.length, 0.0, mi.Color0f()), mi.RayFlags.Minimal, False, True
+                )
+                if dr.hint(hit.is_valid()):
+                    hit.sh_frame = mi.Frame3f(hit.n)
+                    hit.wi = hit.to_local(-omega)
+                    position, towards, pixel, factor, seen = project(cams, camera, hit.p)
+                    seen &= (dr.dot(hit.n, towards) > 0.0) & (dr.dot(hit.n, omega) > 0.0)
+                    if dr.hint(seen):
+                        value = t.bsdf.eval(context, hit, hit.to_local(towards), True)[0]
+                        value *= factor * phase / (phase + lobe)
+                        if dr.hint(value > 0.0):
+                            passed, rng = transmittance(t, point, omega, hit.t, rng)
+                            value *= passed
+                            start = mi.Point3f(hit.p + hit.n * t.lift)
+                            blocked = t.scene.ray_test(
+                                mi.Ray3f(start, towards, FAR, 0.0, mi.Color0f()), False, True
+                            )
+                            splat(
+                                images.lobes, images.lobes_squared, images, base + pixel, pixels,
+                                weight * value, t.lasers, rng, ~blocked,
+                            )  # fmt: skip
+        camera += 1
+    return rng
+
+
+@dr.syntax
+def connect_exit(
+    t: Tables, cams: Cameras, images: Images, tag: Any, si: Any, direction: Any, weight: Any,
+    collision: Any, phase: Any, lobed: Any, surface_only: Any, rng: Rng,
+) -> Rng:  # fmt: skip
+    """Connect a photon that meets the surface to every camera through the boundary's BSDF.
+
+    collision, phase, lobed: the flight's last collision, the phase density of its direction and whether a lobe
+    connection could have made the same path (then the balance heuristic shares it).
+    """
+    pixels = cams.width * cams.height
+    context = mi.BSDFContext(mi.TransportMode.Importance)
+    camera = mi.UInt32(0)
+    while dr.hint(camera < cams.count, label="exits"):
+        position, towards, pixel, factor, seen = project(cams, camera, si.p)
+        seen &= dr.dot(si.n, towards) > 0.0
+        if dr.hint(seen):
+            value = t.bsdf.eval(context, si, si.to_local(towards), True)[0] * factor
+            _, lobe, usable = lobe_density(t, collision, direction, position)
+            value *= dr.select(lobed & usable, phase / (phase + lobe), 1.0)
+            if dr.hint(value > 0.0):
+                start = mi.Point3f(si.p + si.n * t.lift)
+                blocked = t.scene.ray_test(mi.Ray3f(start, towards, FAR, 0.0, mi.Color0f()), False, True)
+                layer = mi.UInt32(0)
+                if dr.hint(images.layers == 2, mode="scalar"):
+                    layer = dr.select(surface_only, mi.UInt32(1), mi.UInt32(0))
+                base = ((tag * images.layers + layer) * cams.count + camera) * (t.lasers * pixels) + pixel
+                splat(
+                    images.exits, images.exits_squared, images, base, pixels, weight * value, t.lasers, rng, ~blocked
+                )
+        camera += 1
+    return rng

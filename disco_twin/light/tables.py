@@ -1,0 +1,122 @@
+"""What the walk reads and what it adds to, and the look-ups in it. Filled by transport.py."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from disco_twin.light.sampling import Rng
+
+FAR = 1e30
+
+
+class Opaque:
+    """Arrays that the walk reads or adds to. Not a dataclass: Dr.Jit would carry its fields through every loop."""
+
+    def __init__(self, **fields: Any) -> None:
+        if set(fields) != set(type(self).__annotations__):
+            raise TypeError(f"{type(self).__name__} takes {sorted(type(self).__annotations__)}")
+        self.__dict__.update(fields)
+
+
+class Tables(Opaque):
+    """What the walk reads; see transport.py for where it comes from. Floats are opaque so that kernels are reused."""
+
+    scene: Any
+    bsdf: Any
+    lasers: int
+    matched: bool
+    eta: float
+    homogeneous: bool
+    isotropic: bool
+    g: Any
+    majorant: Any
+    medium: Any  # Float, per voxel (sigma_t / majorant, albedo...), padded to 2 or 4 channels
+    albedo: Any  # weight type, the homogeneous medium's
+    dims: Any
+    medium_low: Any
+    medium_scale: Any
+    distance: Any
+    normal: Any
+    cells: int
+    low: Any
+    inverse_cell: Any
+    bound: Any
+    faces: Any
+    vertices: Any
+    vertex_count: int
+    lift: Any
+    kappa: Any  # concentration of the lobe
+    reach: Any  # mm: collisions nearer to the surface than this send lobe connections
+    length: Any  # mm: longest lobe connection
+
+
+class Cameras(Opaque):
+    """Cameras of equal size as rows of ROW floats: position, right, down, forward, focal, centre, distortion."""
+
+    count: int
+    width: int
+    height: int
+    rows: Any
+
+
+ROW = 21
+
+
+class Images(Opaque):
+    """Integer accumulators of the images: sums and sums of squares from exits and from lobe connections.
+
+    Index ((tag * layers + layer) * cameras + camera) * lasers + laser) * pixels + pixel; layers are 1 (all light) or 2
+    (light from below the surface, light reflected at it). One count is `quantum` (`quantum_squared`).
+    """
+
+    layers: int
+    exits: Any
+    exits_squared: Any
+    lobes: Any
+    lobes_squared: Any
+    inverse_quantum: Any
+    inverse_quantum_squared: Any
+
+
+class Deposits(Opaque):
+    """Integer accumulators of the power that leaves through the surface, shared among each triangle's vertices.
+
+    Index (tag * lasers + laser) * vertices + vertex; one count is `scale` = `1 / inverse_quantum` watts.
+    """
+
+    total: Any
+    inverse_quantum: Any
+    scale: float
+
+
+def cell_index(t: Tables, q: Any) -> Any:
+    """Flat index of the distance field's cell at q, clamped to the grid's rim."""
+    cell = mi.Point3i(dr.floor((q - t.low) * t.inverse_cell))
+    cell = dr.minimum(dr.maximum(cell, 0), t.cells - 1)
+    return mi.UInt32((cell.z * t.cells + cell.y) * t.cells + cell.x)
+
+
+def medium_at(t: Tables, q: Any, rng: Rng) -> tuple[Any, Any]:
+    """Probability of a real collision and the albedo per wavelength at q.
+
+    One voxel of the eight is drawn with its trilinear weight: sigma_t and sigma_s = albedo * sigma_t are then
+    interpolated linearly in expectation, which is all that an unbiased walk needs, at one look-up instead of eight.
+    """
+    if t.homogeneous:
+        return mi.Float(1.0), t.albedo
+    grid = (q - t.medium_low) * t.medium_scale - 0.5
+    voxel = mi.Point3i(dr.floor(grid + mi.Point3f(rng.next(), rng.next(), rng.next())))
+    voxel = mi.Point3i(
+        dr.clip(voxel.x, 0, t.dims.x - 1), dr.clip(voxel.y, 0, t.dims.y - 1), dr.clip(voxel.z, 0, t.dims.z - 1)
+    )
+    index = mi.UInt32((voxel.z * t.dims.y + voxel.y) * t.dims.x + voxel.x)
+    if t.lasers == 1:
+        value = dr.gather(mi.Vector2f, t.medium, index)
+        return value[0], mi.Color1f(value[1])
+    value = dr.gather(mi.Vector4f, t.medium, index)
+    if t.lasers == 2:
+        return value[0], mi.Vector2f(value[1], value[2])
+    return value[0], mi.Color3f(value[1], value[2], value[3])
