@@ -76,9 +76,9 @@ def test_agrees_with_stock_volpath(boundary: Boundary, heterogeneous: bool, kind
     light = Uniform() if kind == "uniform" else Directional(direction=(-0.7, 0.5, -0.5))
     transport = Transport(obj)
     passes = 16
-    theirs = blocks(volpath_images(obj, camera, light, tmp_path, passes, 256 if kind == "uniform" else 384))
+    theirs = blocks(volpath_images(obj, camera, light, tmp_path, passes, 128 if kind == "uniform" else 192))
     traced = [
-        render_reference(transport, light, [camera], 2 * 300_000, seed)[0].halves.sum(axis=1)[:, 0]
+        render_reference(transport, light, [camera], 2 * 150_000, seed)[0].halves.sum(axis=1)[:, 0]
         for seed in range(passes // 2)
     ]
     ours = blocks(np.concatenate(traced).astype(np.float64))
