@@ -59,7 +59,7 @@ def assert_z(z: ArrayLike, label: str = "", level: float = LEVEL) -> None:
 
 
 def chi_squared(counts: ArrayLike, expected: ArrayLike, fitted: int = 1) -> float:
-    """p-value of Pearson's test; cells that should hold fewer than ten are pooled. `fitted`: lost degrees of freedom."""
+    """p-value of Pearson's test; cells expected below ten are pooled. `fitted`: lost degrees of freedom."""
     counts, expected = np.asarray(counts, float).ravel(), np.asarray(expected, float).ravel()
     small = expected < 10
     if small.any():

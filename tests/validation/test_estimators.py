@@ -14,8 +14,9 @@ from significance import assert_z, z_of_difference, z_of_replicates
 from test_samplers import streams
 from twins import beam, block, camera, pixel_areas, twin
 
-from disco_twin.light import walk as kernel
+from disco_twin.light.connect import project, transmittance
 from disco_twin.light.distance import build_distance_field, sample_surface
+from disco_twin.light.tables import medium_at
 from disco_twin.light.transport import Lobe, Transport, camera_table
 from disco_twin.object import shapes
 from disco_twin.object.build import Boundary, Medium, TwinObject
@@ -138,7 +139,7 @@ def test_transmittance_is_unbiased() -> None:
     rng = streams(seed=9, n=48 * n)
     start = mi.Point3f(np.repeat(a, n, axis=0).T.astype(np.float32))
     direction, length = (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True), np.linalg.norm(b - a, axis=1)
-    value = kernel.transmittance(
+    value, _ = transmittance(
         tables, start, mi.Vector3f(np.repeat(direction, n, axis=0).T.astype(np.float32)),
         mi.Float(np.repeat(length, n).astype(np.float32)), rng,
     )  # fmt: skip
@@ -171,7 +172,7 @@ def test_medium_is_trilinear_in_the_mean() -> None:
     tables = Transport(obj, cells=32)._tables((0,))
     points = np.random.default_rng(5).uniform(-5.5, 5.5, (40, 3))
     n = 1 << 14
-    chance, albedo = kernel.medium_at(
+    chance, albedo = medium_at(
         tables, mi.Point3f(np.repeat(points, n, axis=0).T.astype(np.float32)), streams(seed=10, n=40 * n)
     )
     sigma_t = np.array(chance, np.float64).reshape(40, n) * float(obj.medium.sigma_t.max())
@@ -193,7 +194,7 @@ def test_projection_is_the_cameras() -> None:
     )
     points = np.random.default_rng(6).uniform(-28, 28, (20_000, 3))
     table = camera_table([view])
-    _, towards, pixel, factor, inside = kernel.project(table, mi.UInt32(0), mi.Point3f(points.T.astype(np.float32)))
+    _, towards, pixel, factor, inside = project(table, mi.UInt32(0), mi.Point3f(points.T.astype(np.float32)))
     where, depth = view.project(points)
     expected = (where >= 0).all(axis=1) & (where < [64, 40]).all(axis=1) & (depth > 0)
     near = np.abs(where - np.round(where)).min(axis=1) < 1e-3  # a pixel's edge: single precision decides
