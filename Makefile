@@ -27,7 +27,6 @@ $(READY): pyproject.toml
 
 demo: $(READY)
 	$(BIN)/disco-twin run scenes/quick.toml --out $(OUT)
-	@echo "Report: $(abspath $(OUT))/report.html"
 
 test: $(READY)
 	$(BIN)/python -m pytest

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,6 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.console import Console
 
+from disco_twin.folder import refused_by_the_disk
 from hw.errors import DiscoError
 from pipeline.capture.loop import Interrupted
 
@@ -122,10 +122,10 @@ def main(arguments: list[str] | None = None) -> Any:
     except DiscoError as error:
         return _stop(str(error), 2)
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EROFS):
+        known = refused_by_the_disk(error, Path.cwd())
+        if known is None:
             raise
-        where = f"{error.filename}: " if error.filename else ""
-        return _stop(f"{where}{error.strerror}. Remedy: choose or mend the output folder, repeat the same command", 2)
+        return _stop(str(known), 2)
 
 
 def _stop(message: str, status: int) -> None:

@@ -159,7 +159,9 @@ def picture_figure(spots: Sequence[Impulse], comparisons: Sequence[Comparison], 
     """The README's picture: two recorded spots on a log scale, then relit above reference for some lights."""
     columns = 1 + len(comparisons)
     figure, axes = new_figure(2.0 * columns, 2.85, nrows=2, ncols=columns)
-    for axis, spot, name in zip(axes[:, 0], spots, ("captured: one laser spot", "another (log scale)"), strict=False):
+    for axis, spot, name in zip(
+        axes[:, 0], spots, ("captured: a laser spot (log scale)", "the same spot from behind"), strict=False
+    ):
         shown = np.log10(np.maximum(spot.radiance, spot.radiance.max() * 1e-5))
         axis.imshow(shown, cmap="magma")
         axis.set_title(name, loc="left", fontsize=8)

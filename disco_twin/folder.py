@@ -7,6 +7,7 @@ OUT/twin/       what the pipeline never sees: the simulated responses, true R_d,
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -15,7 +16,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hw.errors import InputError
+from hw.errors import DiscoError, InputError
 from pipeline.resources import measured
 
 FORMAT_VERSION = 1
@@ -146,6 +147,19 @@ class RunFolder:
             "stages": [asdict(s) for s in self.stages.values()],
         }
         write_atomically(self.journal, json.dumps(data, indent=1).encode())
+
+
+def refused_by_the_disk(error: OSError, folder: Path) -> DiscoError | None:
+    """A full or write-protected disk as an error for the user; None for any other reason.
+
+    NumPy reports a full disk without an error number ("16 requested and 0 written").
+    """
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or "requested and" in str(error)
+    if not full and error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return None
+    why = "the disk is full" if full else (error.strerror or str(error)).lower()
+    remedy = "make room" if full else "choose another --out"
+    return DiscoError(f"{error.filename or folder}: {why}. Remedy: {remedy}, repeat the same command")
 
 
 def write_atomically(path: Path, content: bytes) -> None:

@@ -12,7 +12,7 @@ from typing import Any, get_args
 from rich.console import Console
 
 from disco_twin.console import Report, run_log, stage_bar
-from disco_twin.folder import RunFolder, content_key, source_key, write_atomically
+from disco_twin.folder import RunFolder, content_key, refused_by_the_disk, source_key, write_atomically
 from disco_twin.pipeline_process import pipeline_inputs, reconstruct_apart
 from disco_twin.scene import Profile, Scene, load_scene
 from disco_twin.world import World, identity, left_out_by_the_twin
@@ -53,6 +53,8 @@ class Run:
             done = self.folder.run(name, key, watched)
         except KeyboardInterrupt:
             raise Interrupted(f"stopped during {name}; the same command continues") from None
+        except OSError as error:
+            raise refused_by_the_disk(error, self.folder.root) or error from error
         record = self.folder.stages[name]
         note = f"{record.seconds:8.1f} s {record.peak_mb:8.0f} MiB" if done else "finished before"
         self.console.print(f"  {name:<12} {note}", highlight=False)

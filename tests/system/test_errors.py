@@ -81,7 +81,9 @@ def test_an_unknown_method_names_the_known_ones(
 @pytest.mark.parametrize(
     ("error", "status", "said"),
     [
-        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "out/x"), 2, "No space left on device"),
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "out/x"), 2, "out/x: the disk is full. Remedy"),
+        (OSError("7 requested and 0 written"), 2, "out: the disk is full. Remedy"),
+        (OSError(errno.EROFS, os.strerror(errno.EROFS), "out/x"), 2, "out/x: read-only file system. Remedy"),
         (Interrupted("stopped: 3 of 9 images are stored; the same command continues"), 130, "same command continues"),
         (KeyboardInterrupt(), 130, "stopped during scan; the same command continues"),
         (DiscoError("the reason"), 2, "the reason"),
