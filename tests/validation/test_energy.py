@@ -65,6 +65,23 @@ def test_balance(kind: str) -> None:
         assert np.abs(balance.boundary / balance.launched).max() < 1e-7
 
 
+def test_roulette_creates_nothing_in_the_mean() -> None:
+    """Rationale: Russian roulette trades weight for photons; a survivor's weight that is wrong is lost in the noise of
+    every other tally.
+
+    Expected behaviour: the balance's roulette term has the mean zero, for the wavelength that decides and for the
+    weaker one that comes along, z-scores from 32 replicates.
+    """
+    transport = Transport(twin(block(40.0, 10.0), "matched", 1.0, 10.0, [0.9, 0.8]))
+    terms = []
+    for seed in range(REPLICATES):
+        balance = transport.trace(beam(), 1, 10_000, seed=seed).balance
+        assert np.all(balance.roulette != 0)
+        terms.append(balance.roulette)
+    assert np.std(terms, axis=0).max() / math.sqrt(REPLICATES) < 1.5e-4
+    assert_z(z_of_replicates(terms), "roulette")
+
+
 def smith(cosine: F64, alpha: float) -> F64:
     """GGX shadowing of one direction (Walter et al. 2007, eq. 34)."""
     cosine = np.abs(cosine)
