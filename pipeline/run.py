@@ -23,12 +23,14 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError
 
 from hw.errors import DiscoError, InputError
 from hw.record import Sensor
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
 from pipeline.calibrate.camera import PinholeCamera
+from pipeline.calibrate.fresnel import Boundary
 from pipeline.capture.stream import StreamReader
 from pipeline.config import Strict
 from pipeline.reconstruct.methods import METHODS, READINGS, reconstruct
@@ -39,7 +41,7 @@ from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.reconstruct.views import Reading
 from pipeline.relight.irradiance import transmitted_flux
 from pipeline.relight.lights import Light
-from pipeline.relight.relight import view_matrix
+from pipeline.relight.relight import ViewMatrix, view_matrix
 from pipeline.resources import measured
 from pipeline.rig import CameraConfig, RigConfig
 
@@ -143,24 +145,32 @@ def gather(
 
 
 def relight(models: dict[str, ReflectanceModel], request: Request, work: Path, stages: Stages) -> dict[str, float]:
-    """Relit images of every method, light and view; seconds per method beside what they share."""
-    first = next(iter(models.values()))
-    eta, mesh, lasers = first.eta, first.mesh, len(first.reflectance)
+    """Relit images of every method, light and view; seconds per method. Methods with one boundary share the rest."""
     seconds = dict.fromkeys(models, 0.0)
-    with stages.stage("irradiance"):
-        fluxes = {light.name: transmitted_flux(light, mesh, eta, lasers) for light in request.relight.lights}
-    with stages.stage("relight"):
-        matrices = {v.name: view_matrix(mesh, PinholeCamera.from_config(v), eta) for v in request.relight.views}
-        for method, model in models.items():
-            start = time.perf_counter()
+    prepared: dict[Boundary, tuple[dict[str, NDArray[np.float64]], dict[str, ViewMatrix]]] = {}
+    for method, model in models.items():
+        start = time.perf_counter()
+        with stages.stage(f"relight {method}"):
+            if model.boundary not in prepared:
+                prepared[model.boundary] = prepare(model, request.relight)
+            fluxes, matrices = prepared[model.boundary]
             folder = work / "relit" / method
             folder.mkdir(parents=True, exist_ok=True)
             for light, flux in fluxes.items():
                 radiosity = model.radiosity(flux)
                 for view, matrix in matrices.items():
                     np.save(folder / f"{light}@{view}.npy", matrix.image(radiosity))
-            seconds[method] = time.perf_counter() - start
+        seconds[method] = time.perf_counter() - start
     return seconds
+
+
+def prepare(
+    model: ReflectanceModel, wanted: RelightRequest
+) -> tuple[dict[str, NDArray[np.float64]], dict[str, ViewMatrix]]:
+    """Flux (L, V) in W by light and view matrix by view, for the model's mesh and boundary."""
+    mesh, boundary, lasers = model.mesh, model.boundary, len(model.reflectance)
+    fluxes = {light.name: transmitted_flux(light, mesh, boundary, lasers) for light in wanted.lights}
+    return fluxes, {v.name: view_matrix(mesh, PinholeCamera.from_config(v), boundary) for v in wanted.views}
 
 
 def run(capture: Path, work: Path, request: Request) -> dict[str, Any]:

@@ -6,16 +6,33 @@ By reciprocity the same factor holds on the way out, as a function of the direct
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 
-def transmittance(cosine: ArrayLike, eta: float) -> NDArray[np.float64]:
-    """F_t: flux transmitted, 0..1, for the cosine between the outward normal and the direction outside.
+@dataclass(frozen=True)
+class Boundary:
+    """A surface whose transmittance departs from the smooth one: `ratio` at `cosines` (ascending), linear between.
 
-    Same shape as `cosine`; 0 at and below the horizon (cosine <= 0), 1 everywhere above it for eta = 1.
+    A rough surface transmits more at grazing angles than a smooth one of the same index.
     """
+
+    eta: float
+    cosines: tuple[float, ...] = (1.0,)
+    ratio: tuple[float, ...] = (1.0,)
+
+
+def transmittance(cosine: ArrayLike, eta: float | Boundary) -> NDArray[np.float64]:
+    """F_t: flux transmitted, for the cosine between the outward normal and the direction outside.
+
+    Same shape as `cosine`; 0 at and below the horizon (cosine <= 0), 1 everywhere above it for eta = 1. `eta` is the
+    relative index of a smooth boundary, or a measured `Boundary`.
+    """
+    if isinstance(eta, Boundary):
+        c = np.asarray(cosine, np.float64)
+        return np.asarray(transmittance(c, eta.eta) * np.interp(c, eta.cosines, eta.ratio))
     if eta < 1:
         raise ValueError(f"relative index {eta} < 1: the light comes from the thinner side")
     outside = np.clip(np.asarray(cosine, np.float64), 0.0, 1.0)

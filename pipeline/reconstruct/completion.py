@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from pipeline.reconstruct.exitance import measure_boundary
 from pipeline.reconstruct.harmonics import Harmonics, harmonics
 from pipeline.reconstruct.mesh import interpolation
 from pipeline.reconstruct.model import ReflectanceModel
@@ -30,11 +31,11 @@ F32 = NDArray[np.float32]
 log = logging.getLogger(__name__)
 
 RANGE_MM_PER_EDGE = 1.3  # correlation length of G in edges; fitted on the quick scene against its truth
-NEAR, FAR, TURN_MM = 0.15, 0.6, 6.0  # s(distance): relative deviation of R_d from the profile
-ROUNDS = 3  # of Gauss-Newton
-PROFILE_ROUNDS = 2
-TOLERANCE = 1e-3  # of conjugate gradients
+NEAR, FAR, TURN_MM = 0.08, 0.6, 6.0  # s(distance): relative deviation of R_d from the profile
+ROUNDS = 2  # of Gauss-Newton, for each of as many fits of the profile
+TOLERANCE = 1e-2  # of conjugate gradients; every solve starts from the one before
 MOST_STEPS = 300
+MOST_HARMONICS = 500
 
 
 def deviation(distance: F64) -> F64:
@@ -71,18 +72,19 @@ class SymmetricField:
         y = self.spots.T @ (entries @ self.vertices)
         return np.asarray((y + y.T) / 2)
 
-    def solve(self, target: F64, weight: F64, scale: F64) -> F32:
+    def solve(self, target: F64, weight: F64, scale: F64, start: F32) -> F32:
         """Y that minimises sum weight (target - scale * field)^2 + Y penalty Y, by preconditioned conjugate gradients.
 
-        target, weight, scale: (S, V); weight is 0 where nothing was observed.
+        target, weight, scale: (S, V); weight is 0 where nothing was observed. start: (n, n) first guess.
         """
         w = (weight * scale**2).astype(np.float32)
-        residual = self.gather((weight * scale * target).astype(np.float32))
+        right = self.gather((weight * scale * target).astype(np.float32))
         precondition = 1.0 / (self.penalty + 0.5 * w.sum())
-        y = np.zeros_like(residual)
+        y = start
+        residual = right - self.gather(w * self.at_spots(y)) - self.penalty * y
         z = residual * precondition
         direction, size = z, float((residual * z).sum())
-        stop = TOLERANCE**2 * size
+        stop = TOLERANCE**2 * float((right * right * precondition).sum())
         for _ in range(MOST_STEPS):
             if size <= stop:
                 return y
@@ -107,24 +109,27 @@ def measured_of(samples: Samples, laser: int) -> Measured:
     return Measured(value, observed, dark, noise)
 
 
-def complete_laser(samples: Samples, laser: int, field: SymmetricField) -> F64:
-    """(V, V) completed R_d of one laser in mm^-2, symmetric and positive."""
+def complete_laser(samples: Samples, laser: int, field: SymmetricField, start: F32) -> tuple[F64, F64, F32]:
+    """One laser: (V, V) completed R_d, symmetric and positive, (S, V) R_d at the spots, both in mm^-2, and Y.
+
+    start: (n, n) first guess of Y, the laser's before.
+    """
     pairs, vertex_pairs = samples.spot_pairs, samples.vertex_pairs
     measured = measured_of(samples, laser)
     edge = float(samples.mesh.edges_unique_length.mean())
-    scale = deviation(pairs.distance)
-    fit = np.zeros_like(scale)
-    y = np.zeros_like(field.penalty)
-    for _ in range(PROFILE_ROUNDS):
+    scale, y = deviation(pairs.distance), start
+    fit = field.at_spots(y).astype(np.float64)
+    for _ in range(ROUNDS):
         profile = fit_profile(pairs, measured, edge, scale * fit)
         prior = pairs.mean(profile)
         for _ in range(ROUNDS):
             relative, weight = measured.residual(prior * np.exp(scale * fit), pairs.distance)
-            y = field.solve(relative + scale * fit, weight, scale)
+            y = field.solve(relative + scale * fit, weight, scale, y)
             fit = field.at_spots(y).astype(np.float64)
     kernel = vertex_pairs.mean(profile)
     exponent = deviation(vertex_pairs.distance) * (field.vertices @ y @ field.vertices.T)
-    return np.asarray(0.5 * (kernel + kernel.T) * np.exp(0.5 * (exponent + exponent.T)))
+    complete = 0.5 * (kernel + kernel.T) * np.exp(0.5 * (exponent + exponent.T))
+    return complete, prior * np.exp(scale * fit), y
 
 
 def unexplained(samples: Samples, basis: Harmonics, range_mm: float) -> F64:
@@ -157,10 +162,15 @@ def measured_entries(samples: Samples) -> NDArray[np.bool_]:
 def complete(samples: Samples) -> ReflectanceModel:
     """The default method: samples -> model."""
     range_mm = RANGE_MM_PER_EDGE * float(samples.mesh.edges_unique_length.mean())
-    basis = harmonics(samples.mesh)
+    basis = harmonics(samples.mesh, MOST_HARMONICS)
     to_spots = interpolation(samples.mesh, samples.spots.triangle, samples.spots.barycentric)
     field = SymmetricField.of(basis, to_spots, range_mm)
-    reflectance = np.stack([complete_laser(samples, k, field) for k in range(len(samples.values))])
+    y, found, at_spots = np.zeros_like(field.penalty), [], []
+    for laser in range(len(samples.values)):
+        entries, at_spot, y = complete_laser(samples, laser, field, y)
+        found.append(entries)
+        at_spots.append(at_spot)
+    reflectance = np.stack(found)
     distance = samples.vertex_pairs.distance
     relative = deviation(distance) ** 2 * unexplained(samples, basis, range_mm) + scatter(distance) ** 2
     return ReflectanceModel(
@@ -168,6 +178,6 @@ def complete(samples: Samples) -> ReflectanceModel:
         reflectance.astype(np.float32),
         (reflectance**2 * relative).astype(np.float32),
         measured_entries(samples),
-        samples.eta,
+        measure_boundary(samples.mesh, samples.eta, samples.glow, np.stack(at_spots)),
         {"method": "default"},
     )

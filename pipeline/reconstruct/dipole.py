@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from pipeline.calibrate.fresnel import Boundary
 from pipeline.reconstruct.completion import measured_entries, measured_of
 from pipeline.reconstruct.distances import Kernel
 from pipeline.reconstruct.mesh import vertex_areas
@@ -74,6 +75,6 @@ def fit_dipole(samples: Samples) -> ReflectanceModel:
     reflectance = np.stack([0.5 * (k + k.T) for k in kernels]).astype(np.float32)
     told = "; ".join(f"sigma_s' {s:.4g}, sigma_a {a:.4g} per mm" for s, a in found)
     return ReflectanceModel(
-        samples.mesh, reflectance, np.zeros_like(reflectance), measured_entries(samples), samples.eta,
+        samples.mesh, reflectance, np.zeros_like(reflectance), measured_entries(samples), Boundary(samples.eta),
         {"method": "dipole", "fit": told},
     )  # fmt: skip

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from pipeline.calibrate.fresnel import Boundary
 from pipeline.reconstruct.completion import measured_entries
 from pipeline.reconstruct.model import ReflectanceModel
 from pipeline.reconstruct.samples import Samples
@@ -78,6 +79,6 @@ def resample_2004(samples: Samples) -> ReflectanceModel:
     filled = [fill(*distribute(samples, laser), step) for laser in range(len(samples.values))]
     reflectance = np.stack(filled).astype(np.float32)
     return ReflectanceModel(
-        samples.mesh, reflectance, np.zeros_like(reflectance), measured_entries(samples), samples.eta,
+        samples.mesh, reflectance, np.zeros_like(reflectance), measured_entries(samples), Boundary(samples.eta),
         {"method": "disco2004"},
     )  # fmt: skip

@@ -31,7 +31,7 @@ class Harmonics:
         return np.asarray((self.functions * (spectrum / spectrum.sum())) @ self.functions.T)
 
 
-def harmonics(mesh: trimesh.Trimesh, most: int = 1500) -> Harmonics:
+def harmonics(mesh: trimesh.Trimesh, most: int) -> Harmonics:
     """The smoothest `most` eigenfunctions (all of them on smaller meshes), with lumped masses."""
     area = vertex_areas(mesh)
     scale = 1.0 / np.sqrt(area)

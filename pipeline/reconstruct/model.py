@@ -6,7 +6,7 @@ import json
 import os
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Self
 
@@ -15,6 +15,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from hw.errors import InputError
+from pipeline.calibrate.fresnel import Boundary
 
 F32 = NDArray[np.float32]
 
@@ -29,14 +30,15 @@ class ReflectanceModel:
 
     mesh: V vertices, mm; reflectance: (L, V_in, V_out) mm^-2, symmetric, mean over both hat functions;
     variance: same shape; measured: (V, V) entries that an observed spot near one vertex and the other one support;
-    eta: assumed refractive index; provenance: how it came about (method, settings)
+    boundary: assumed index and, if it was measured, how its transmittance departs from the smooth one;
+    provenance: how it came about (method, settings)
     """
 
     mesh: trimesh.Trimesh
     reflectance: F32
     variance: F32
     measured: NDArray[np.bool_]
-    eta: float
+    boundary: Boundary
     provenance: Mapping[str, str]
 
     def radiosity(self, flux: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -45,7 +47,12 @@ class ReflectanceModel:
 
     def save(self, path: Path) -> None:
         """Write an .npz, replacing any older one at once."""
-        head = {"format_version": FORMAT_VERSION, "units": UNITS, "eta": self.eta, "provenance": dict(self.provenance)}
+        head = {
+            "format_version": FORMAT_VERSION,
+            "units": UNITS,
+            "boundary": asdict(self.boundary),
+            "provenance": dict(self.provenance),
+        }
         partial = path.with_suffix(".part")
         with partial.open("wb") as file:
             np.savez(
@@ -80,7 +87,9 @@ class ReflectanceModel:
             raise InputError("unknown units", file=path, key="units", value=head.get("units"), remedy=remedy)
         _check(path, arrays)
         mesh = trimesh.Trimesh(arrays["vertices"], arrays["faces"], process=False)
-        return cls(mesh, arrays["reflectance"], arrays["variance"], arrays["measured"], head["eta"], head["provenance"])
+        b = head["boundary"]
+        boundary = Boundary(float(b["eta"]), tuple(b["cosines"]), tuple(b["ratio"]))
+        return cls(mesh, arrays["reflectance"], arrays["variance"], arrays["measured"], boundary, head["provenance"])
 
 
 def _check(path: Path, arrays: Mapping[str, NDArray[np.generic]]) -> None:

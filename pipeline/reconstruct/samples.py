@@ -18,6 +18,7 @@ from scipy import ndimage
 
 from hw.record import RadianceImage
 from pipeline.calibrate.calibration import Calibration
+from pipeline.calibrate.camera import PinholeCamera
 from pipeline.capture.plan import ImageAddress, Plan
 from pipeline.capture.stream import CorruptImage, StreamReader
 from pipeline.reconstruct.distances import Pairs, spot_pairs, vertex_pairs
@@ -36,11 +37,24 @@ NOISE_MASK = np.outer([1, -2, 1], [1, -2, 1]) / 6.0
 
 
 @dataclass(frozen=True)
+class Glow:
+    """One view's sum of images over its spots, each as pi L / (F_t(w_i) Phi), so that the power of spots is 1.
+
+    camera: in the object frame; image: (L, H, W) mm^-2; included: (L, S) the spots in the sum
+    """
+
+    camera: PinholeCamera
+    image: F64
+    included: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
 class Samples:
     """Measured R_d between spots and vertices.
 
     values: (L, S, V) mm^-2, NaN where not observed; averaged over the hat function of the vertex and over the beam
     dark_variance, noise_per_signal: (L, S, V); an entry of expectation m has variance dark + per_signal * m
+    glow: per view, images summed over its spots
     """
 
     mesh: trimesh.Trimesh
@@ -49,6 +63,7 @@ class Samples:
     values: F32
     dark_variance: F32
     noise_per_signal: F32
+    glow: tuple[Glow, ...] = ()
 
     @property
     def variance(self) -> F32:
@@ -123,7 +138,7 @@ class _Gathered:
             out[part] = np.where(total > 0, own, mean)
         return out
 
-    def combined(self, mesh: trimesh.Trimesh, eta: float, spots: Spots) -> Samples:
+    def combined(self, mesh: trimesh.Trimesh, eta: float, spots: Spots, glow: tuple[Glow, ...]) -> Samples:
         """One value per laser, spot and vertex: the cameras' mean, by share of the footprint seen and view cosine."""
         weight = np.zeros(self.value.shape[1:], np.float32)  # (S, C, V)
         for view, reading in enumerate(self.readings):
@@ -135,7 +150,7 @@ class _Gathered:
         value = np.where(weight > 0, weight * self.value, 0.0).sum(axis=2) / norm
         dark = (weight**2 * self.dark).sum(axis=2) / norm**2
         slope = (weight**2 * self.noise_per_signal()).sum(axis=2) / norm**2
-        return Samples(mesh, eta, spots, value, dark, slope)
+        return Samples(mesh, eta, spots, value, dark, slope, glow)
 
 
 def take_samples(
@@ -150,6 +165,7 @@ def take_samples(
     spots = locate_spots(mesh, calibration, plan, settings)
     gathered = {name: _Gathered(lasers, plan, views) for name, views in readings.items()}
     addresses = [a for a in plan.addresses() if a.kind == "spot" and spots.transmitted[a.spot] > 0]
+    glow = tuple(_no_glow(calibration.view_camera(v), lasers, len(plan.spots)) for v in range(plan.views))
     corrupt, saturated = [], 0
     for address, raw in zip(addresses, stream.read_many(addresses), strict=True):
         if isinstance(raw, CorruptImage):
@@ -164,10 +180,13 @@ def take_samples(
         image = calibration.radiance(raw, address.view, address.laser)
         saturated += int(image.saturated.sum())
         noise = noise_squared(image.radiance)
+        scale = np.pi / (spots.transmitted[address.spot] * power)
+        glow[address.view].image[address.laser] += image.radiance * scale
+        glow[address.view].included[address.laser, address.spot] = True
         for g in gathered.values():
-            g.add(address, image, noise, np.pi / (spots.transmitted[address.spot] * power))
+            g.add(address, image, noise, scale)
     masked = sum(_mask_highlights(g, spots, calibration, mesh, settings.highlight_deg) for g in gathered.values())
-    samples = {name: g.combined(mesh, settings.eta, spots) for name, g in gathered.items()}
+    samples = {name: g.combined(mesh, settings.eta, spots, glow) for name, g in gathered.items()}
     first = next(iter(samples.values()))
     statistics = SampleStatistics(
         images=len(addresses),
@@ -179,6 +198,10 @@ def take_samples(
         coverage=float(np.isfinite(first.values).mean()),
     )
     return samples, statistics
+
+
+def _no_glow(camera: PinholeCamera, lasers: int, spots: int) -> Glow:
+    return Glow(camera, np.zeros((lasers, camera.height, camera.width)), np.zeros((lasers, spots), bool))
 
 
 def _mask_highlights(
@@ -210,4 +233,5 @@ def select_lasers(samples: Samples, lasers: NDArray[np.int64]) -> Samples:
         values=samples.values[lasers],
         dark_variance=samples.dark_variance[lasers],
         noise_per_signal=samples.noise_per_signal[lasers],
+        glow=tuple(replace(g, image=g.image[lasers], included=g.included[lasers]) for g in samples.glow),
     )

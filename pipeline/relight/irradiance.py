@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import linalg as sparse_linalg
 
-from pipeline.calibrate.fresnel import transmittance
+from pipeline.calibrate.fresnel import Boundary, transmittance
 from pipeline.relight.arrival import colour, finest_mm, from_many_directions, from_one_direction
 from pipeline.relight.lights import Environment, Light, Uniform
 from pipeline.relight.surface import F64, Int, Surface
@@ -51,7 +51,7 @@ class Accuracy:
 
 
 def received(
-    surface: Surface, light: Light, face: Int, points: F64, eta: float, lasers: int, directions: int = 256
+    surface: Surface, light: Light, face: Int, points: F64, eta: float | Boundary, lasers: int, directions: int = 256
 ) -> NDArray[np.float64]:
     """(L, N) transmitted flux density T in W/mm^2 at (N, 3) points on (N,) faces. eta = 1: the plain irradiance."""
     if isinstance(light, Uniform | Environment):
@@ -65,7 +65,13 @@ def received(
 
 
 def _received_from_many(
-    surface: Surface, light: Uniform | Environment, face: Int, points: F64, eta: float, lasers: int, count: int
+    surface: Surface,
+    light: Uniform | Environment,
+    face: Int,
+    points: F64,
+    eta: float | Boundary,
+    lasers: int,
+    count: int,
 ) -> F64:
     total = np.zeros((lasers, len(face)))
     step = max(1, _CHUNK // count)
@@ -109,7 +115,7 @@ def _split(face: Int, bary: F64) -> tuple[Int, F64]:
 
 
 def _moments(
-    surface: Surface, light: Light, face: Int, bary: F64, eta: float, lasers: int, directions: int
+    surface: Surface, light: Light, face: Int, bary: F64, eta: float | Boundary, lasers: int, directions: int
 ) -> NDArray[np.float64]:
     """(L, C, 3) integrals of T times the face's three hat functions over each cell, in W."""
     at = np.einsum("pj,cjb->cpb", _RULE, bary)  # (C, 3 points, 3)
@@ -121,7 +127,7 @@ def _moments(
 
 
 def hat_moments(
-    light: Light, mesh: trimesh.Trimesh, eta: float, lasers: int, accuracy: Accuracy | None = None
+    light: Light, mesh: trimesh.Trimesh, eta: float | Boundary, lasers: int, accuracy: Accuracy | None = None
 ) -> NDArray[np.float64]:
     """(L, V) integrals of hat_u T dA in W; they add up to all the flux that passes the boundary."""
     accuracy = accuracy or Accuracy()
@@ -153,7 +159,7 @@ def hat_moments(
 
 
 def transmitted_flux(
-    light: Light, mesh: trimesh.Trimesh, eta: float, lasers: int, accuracy: Accuracy | None = None
+    light: Light, mesh: trimesh.Trimesh, eta: float | Boundary, lasers: int, accuracy: Accuracy | None = None
 ) -> NDArray[np.float64]:
     """(L, V) flux q in W for radiosity = sum_u R_d[u, :] q_u, with R_d averaged over hat functions.
 

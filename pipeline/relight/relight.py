@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from pipeline.calibrate.camera import PinholeCamera
-from pipeline.calibrate.fresnel import transmittance
+from pipeline.calibrate.fresnel import Boundary, transmittance
 from pipeline.relight.surface import Surface
 
 if TYPE_CHECKING:
@@ -48,7 +48,9 @@ def _shading_normals(surface: Surface) -> NDArray[np.float64]:
     return np.where((smooth * flat).sum(axis=2, keepdims=True) < _CREASE, flat, smooth)
 
 
-def view_matrix(mesh: trimesh.Trimesh, camera: PinholeCamera, eta: float, supersample: int = 4) -> ViewMatrix:
+def view_matrix(
+    mesh: trimesh.Trimesh, camera: PinholeCamera, eta: float | Boundary, supersample: int = 4
+) -> ViewMatrix:
     """Trace supersample^2 rays a pixel; radiosity is linear on the faces. One matrix serves all lights of a view."""
     surface = Surface.of(mesh)
     origins, directions = camera.rays(camera.pixel_centres(supersample))
@@ -69,7 +71,11 @@ def view_matrix(mesh: trimesh.Trimesh, camera: PinholeCamera, eta: float, supers
 
 
 def relit_image(
-    radiosity: NDArray[np.float64], mesh: trimesh.Trimesh, camera: PinholeCamera, eta: float, supersample: int = 4
+    radiosity: NDArray[np.float64],
+    mesh: trimesh.Trimesh,
+    camera: PinholeCamera,
+    eta: float | Boundary,
+    supersample: int = 4,
 ) -> NDArray[np.float32]:
     """(L, V) radiosity in W/mm^2 -> (L, H, W) radiance in W/(mm^2 sr). For several lights keep the `view_matrix`."""
     return view_matrix(mesh, camera, eta, supersample).image(radiosity)
