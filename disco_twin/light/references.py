@@ -59,10 +59,12 @@ def render_reference(
 
 
 def save_reference(path: Path, reference: Reference) -> None:
-    """One EXR of half floats, channels `<layer>.<half>.<laser>`, scaled so that the brightest value is 1."""
+    """One EXR of half floats, channels `<layer>.<half>.<laser>`, scaled so that the brightest value is 6e4: half floats
+    then resolve light that is ten decades fainter.
+    """
     import OpenEXR
 
-    scale = float(reference.halves.max()) or 1.0
+    scale = (float(reference.halves.max()) or 1.0) / 6e4
     channels = {
         f"{layer}.{half}.{laser}": np.ascontiguousarray(reference.halves[h, k, laser] / scale).astype(np.float16)
         for h, half in enumerate(HALVES)

@@ -56,7 +56,7 @@ class BeamSource:
         self.origins, self.directions, self.last = to_float(origins), to_float(directions), len(origins) - 1
         self.radius, self.gaussian = dr.opaque(mi.Float, radius), profile == "gaussian"
         self.power, self.weight = to_float(power), weight_type(np.atleast_2d(power).shape[1])
-        self.scale = float(np.max(power))
+        self.scale = max(float(np.max(power)), 1e-30)
 
     def launch(self, rng: Rng, tag: Any, active: Any) -> tuple[Any, Any, Any]:
         tag = dr.minimum(tag, self.last)  # a light's single beam serves all of its replicates
@@ -132,7 +132,7 @@ class DirectionalSource:
         self.side, self.offset = opaque3(mi.Vector3f, side), float(light.edge_offset_mm)
         self.edged, self.radius = light.edge_side is not None, radius
         power = light.irradiance * math.pi * radius**2 * np.asarray(light.colour)
-        self.power, self.weight, self.scale = to_float(power), weight_type(len(power)), float(power.max())
+        self.power, self.weight, self.scale = to_float(power), weight_type(len(power)), max(float(power.max()), 1e-30)
 
     def launch(self, rng: Rng, tag: Any, active: Any) -> tuple[Any, Any, Any]:
         disc = sampling.uniform_disc(rng)
@@ -155,8 +155,9 @@ class EnvironmentSource:
         kappa = [float(lobe.sharpness) for lobe in light.lobes]
         share = [4 * math.pi * float(np.mean(light.constant))]
         share += [float(p.mean()) * 2 * math.pi / k * (1 - math.exp(-2 * k)) for p, k in zip(peak, kappa, strict=True)]
-        self.share = np.asarray(share) / sum(share)
-        self.scale = sum(share) * math.pi * radius**2
+        total = max(sum(share), 1e-30)  # black light is allowed
+        self.share = np.asarray(share) / total
+        self.scale = total * math.pi * radius**2
         self.lobes = [
             (opaque3(mi.Vector3f, a), to_float(p), dr.opaque(mi.Float, k))
             for a, p, k in zip(axes, peak, kappa, strict=True)

@@ -201,7 +201,7 @@ class Transport:
                 balance = walk(
                     tables, source, table, pictures, powers, dr.opaque(mi.UInt32, n * m), dr.opaque(mi.UInt32, m),
                     dr.opaque(mi.UInt32, first + start), dr.opaque(mi.UInt32, low), names,
-                    dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), lanes,
+                    dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), dr.opaque(mi.Float, 1.0 / source.scale), lanes,
                 )  # fmt: skip
                 dr.eval(balance)
                 for name in total:

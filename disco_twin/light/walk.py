@@ -183,12 +183,13 @@ def cross(
 @dr.syntax
 def walk(
     t: Tables, source: Source, cams: Cameras | None, images: Images | None, deposits: Deposits | None,
-    count: Any, per_tag: Any, first: Any, first_tag: Any, streams: Any, seed: Any, lanes: int,
+    count: Any, per_tag: Any, first: Any, first_tag: Any, streams: Any, seed: Any, inverse_scale: Any, lanes: int,
 ) -> Balance:  # fmt: skip
     """Walk `count` photons, `per_tag` of each tag, numbers `first`... of their tag's stream; returns the balance.
 
     Tags start at `first_tag` for the source and the streams, at 0 in the accumulators. streams: UInt32 per tag, the
-    name of its random stream; results depend on (seed, stream, photon number) alone.
+    name of its random stream; results depend on (seed, stream, photon number) alone. inverse_scale: 1 / the source's
+    usual weight.
     """
     weight = weight_type(t.lasers)
     wide = dr.float64_array_t(weight)  # sums in double precision: a few lanes may walk most of the photons
@@ -235,8 +236,8 @@ def walk(
                 rng = connect_lobes(t, cams, images, photon.tag, reservoir.point, reservoir.before, drawn, rng)
                 reservoir.seen = mi.Float(0.0)
 
-        # 4. Russian roulette on the largest weight, towards 0.2.
-        strongest = dr.max(photon.w)
+        # 4. Russian roulette on the largest weight, towards 0.2 of a launched one.
+        strongest = dr.max(photon.w) * inverse_scale
         if dr.hint(photon.alive & photon.inside & (strongest < 0.1)):
             chance = strongest * 5.0
             survives = rng.next() < chance
