@@ -15,8 +15,10 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
-from pipeline.reconstruct.mesh import interpolation, vertex_areas
+from pipeline.reconstruct.mesh import vertex_areas
 from pipeline.reconstruct.spots import Spots
 
 F64 = NDArray[np.float64]
@@ -44,31 +46,40 @@ class Pairs:
 
     def mean(self, kernel: Kernel) -> F64:
         """(N, V) mean of kernel(distance) over both patches; the kernel is positive."""
-        far = np.log(kernel(self.distance))
-        step = 0.02 * self.centres[-1]
-        ahead = np.log(kernel(self.distance + step))
-        behind = np.log(kernel(np.maximum(self.distance - step, 0.0)))
-        slope, bend = (ahead - behind) / (2 * step), (ahead - 2 * far + behind) / step**2
-        # Laplacian of the kernel over the kernel, in the plane, in terms of its logarithm.
-        laplacian = bend + slope**2 + slope / np.maximum(self.distance, step)
-        out = np.exp(far + 0.5 * self.spread * np.clip(laplacian, -1 / self.spread, 1 / self.spread))
+        # Far pairs: the kernel is locally exponential; its Laplacian in the plane over itself is slope^2 + slope / r.
+        step = 0.04 * self.centres[-1]
+        ahead, behind = kernel(self.distance + step), kernel(np.maximum(self.distance - step, 0.0))
+        slope = np.log(ahead / behind) / (2 * step)
+        laplacian = slope**2 + slope / np.maximum(self.distance, step)
+        out = kernel(self.distance) * np.exp(0.5 * self.spread * np.minimum(laplacian, 1 / self.spread))
         out[self.first, self.second] = self.histogram @ kernel(self.centres)
         return np.asarray(out)
 
 
-def subtriangle_points(mesh: trimesh.Trimesh, n: int) -> tuple[F64, sparse.csr_array]:
-    """Centroids (Q, 3) of n^2 equal parts per triangle and (V, Q) weights that average over each hat function."""
+@dataclass(frozen=True)
+class HatPoints:
+    """Points on the surface, each a part of the three hat functions of its triangle.
+
+    points: (Q, 3) mm; vertices: (Q, 3); weights: (Q, 3) share of each hat's integral, adding up to 1 per vertex
+    """
+
+    points: F64
+    vertices: I64
+    weights: F64
+
+
+def hat_points(mesh: trimesh.Trimesh, n: int) -> HatPoints:
+    """Centroids of n^2 equal parts per triangle."""
     corner = np.array([(i, j) for i in range(n) for j in range(n - i)], float)
     up = (corner + 1 / 3) / n
     down = (corner[corner.sum(axis=1) < n - 1] + 2 / 3) / n
     inner = np.concatenate([up, down])
     local = np.column_stack([1 - inner.sum(axis=1), inner])
-    triangle = np.repeat(np.arange(len(mesh.faces)), len(local))
-    barycentric = np.tile(local, (len(mesh.faces), 1))
-    points = np.einsum("qk,qkx->qx", barycentric, np.asarray(mesh.triangles)[triangle])
-    area = np.repeat(mesh.area_faces / len(local), len(local))
-    hats = interpolation(mesh, triangle, barycentric).multiply(area[:, None]).T.tocsr()
-    return points, sparse.csr_array(sparse.diags_array(1.0 / vertex_areas(mesh)) @ hats)
+    points = np.einsum("qk,fkx->fqx", local, np.asarray(mesh.triangles)).reshape(-1, 3)
+    vertices = np.repeat(np.asarray(mesh.faces, np.int64), len(local), axis=0)
+    area = np.repeat(np.asarray(mesh.area_faces, np.float64) / len(local), len(local))
+    weights = np.tile(local, (len(mesh.faces), 1)) * area[:, None] / vertex_areas(mesh)[vertices]
+    return HatPoints(points, vertices, weights)
 
 
 def beam_points(spots: Spots) -> F64:
@@ -91,19 +102,19 @@ def _pairs(mesh: trimesh.Trimesh, centres: F64, patches: list[tuple[F64, F64]], 
     edge = float(mesh.edges_unique_length.mean())
     width, reach = edge / BINS_PER_EDGE, REACH * edge
     bins = int(np.ceil((reach + 4 * mesh.edges_unique_length.max()) / width))
-    points, weights = subtriangle_points(mesh, 4)
-    to_vertex = weights.tocsc()
+    parts = hat_points(mesh, 4)
+    tree = cKDTree(parts.points)
     distance = np.linalg.norm(centres[:, None] - np.asarray(mesh.vertices)[None], axis=2)
     first, second, blocks = [], [], []
     for i, (here, share) in enumerate(patches):
         near = np.flatnonzero(distance[i] < reach)
         local = np.full(len(mesh.vertices), -1)
         local[near] = np.arange(len(near))
-        candidates = np.flatnonzero(((points - centres[i]) ** 2).sum(axis=1) < (reach + 1.5 * edge) ** 2)
-        part = to_vertex[:, candidates].tocoo()
-        keep = local[part.row] >= 0
-        vertex, column, weight = local[part.row[keep]], part.col[keep], part.data[keep]
-        between = np.linalg.norm(here[:, None] - points[candidates][None], axis=2)
+        candidates = np.array(tree.query_ball_point(centres[i], reach + 1.5 * edge))
+        vertex = local[parts.vertices[candidates]]
+        column, corner = np.nonzero(vertex >= 0)
+        vertex, weight = vertex[column, corner], parts.weights[candidates][column, corner]
+        between = cdist(here, parts.points[candidates])
         slot = np.minimum((between / width).astype(np.int64), bins - 1)[:, column] + vertex * bins
         amount = share[:, None] * weight
         table = np.bincount(slot.ravel(), amount.ravel(), minlength=len(near) * bins)
@@ -117,8 +128,8 @@ def _pairs(mesh: trimesh.Trimesh, centres: F64, patches: list[tuple[F64, F64]], 
 
 
 def _hat_spread(mesh: trimesh.Trimesh) -> float:
-    """Mean variance per axis of a hat function about its vertex, mm^2 (equilateral triangles: 5/36 edge^2)."""
-    return float(5.0 / 36.0 * (mesh.edges_unique_length**2).mean())
+    """Mean variance per axis of a hat function about its vertex, mm^2 (equilateral triangles: edge^2 / 8)."""
+    return float((mesh.edges_unique_length**2).mean() / 8.0)
 
 
 def spot_pairs(mesh: trimesh.Trimesh, spots: Spots) -> Pairs:
@@ -131,7 +142,10 @@ def spot_pairs(mesh: trimesh.Trimesh, spots: Spots) -> Pairs:
 
 def vertex_pairs(mesh: trimesh.Trimesh) -> Pairs:
     """Hat functions against hat functions: what the model holds. The points differ, so that no distance is 0."""
-    points, weights = subtriangle_points(mesh, 3)
-    rows = [weights[[v]].tocoo() for v in range(len(mesh.vertices))]
-    patches = [(points[row.col], row.data) for row in rows]
+    parts = hat_points(mesh, 3)
+    vertex, weight = parts.vertices.ravel(), parts.weights.ravel()
+    order = np.argsort(vertex, kind="stable")
+    point = np.repeat(np.arange(len(parts.points)), 3)[order]
+    ends = np.cumsum(np.bincount(vertex, minlength=len(mesh.vertices)))[:-1]
+    patches = list(zip(np.split(parts.points[point], ends), np.split(weight[order], ends), strict=True))
     return _pairs(mesh, np.asarray(mesh.vertices), patches, 2 * _hat_spread(mesh))

@@ -22,6 +22,7 @@ NEAR_SCATTER = 0.1  # relative scatter of R_d about a smooth model, near the spo
 FAR_SCATTER = 0.3  # and how it grows with log(1 + distance / SCATTER_MM)
 SCATTER_MM = 5.0
 OUTLIER = 3.0  # standard deviations from which on a value counts less (Huber)
+LARGEST_STEP = 2.0  # relative: what lies further from its expectation is taken to lie here
 ITERATIONS = 12
 
 
@@ -35,12 +36,15 @@ class Measured:
     noise: F64
 
     def residual(self, expected: F64, distance: F64) -> tuple[F64, F64]:
-        """Relative residual value / expected - 1, clipped to [-1, 2], and its weight (0 where unobserved)."""
+        """Relative residual value / expected - 1 and its weight (0 where unobserved), outliers bounded.
+
+        The bounds are symmetric in units of the noise: noise that drowns a signal must not raise it.
+        """
         relative = np.where(self.observed, self.value / expected - 1.0, 0.0)
-        noise = (self.dark + self.noise * expected) / expected**2
-        weight = np.where(self.observed, 1.0 / (noise + scatter(distance) ** 2), 0.0)
-        excess = np.abs(relative) * np.sqrt(weight) / OUTLIER
-        return np.clip(relative, -1.0, 2.0), weight / np.maximum(excess, 1.0)
+        deviation = np.sqrt((self.dark + self.noise * expected) / expected**2 + scatter(distance) ** 2)
+        weight = np.where(self.observed, 1.0 / deviation**2, 0.0)
+        bound = np.maximum(LARGEST_STEP, OUTLIER * deviation)
+        return np.clip(relative, -bound, bound), weight / np.maximum(np.abs(relative) / (OUTLIER * deviation), 1.0)
 
 
 def scatter(distance: F64) -> F64:
@@ -96,7 +100,7 @@ def fit_profile(pairs: Pairs, measured: Measured, edge: float, offset: F64 | flo
     profile = Profile(knots, _start(profile, measured, pairs.distance))
     near_basis, basis = profile.basis(pairs.centres), profile.basis(pairs.distance)
     bend = np.diff(np.eye(basis.shape[2]), 2, axis=0)
-    stiff = 0.1 * bend.T @ bend
+    stiff = bend.T @ bend
     for _ in range(ITERATIONS):
         expected = pairs.mean(profile)
         jacobian = basis.copy()

@@ -1,0 +1,244 @@
+"""The completion on objects whose R_d is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from reconstruct_synthetic import make
+
+from pipeline.reconstruct.completion import SymmetricField, complete, complete_laser, deviation, measured_entries
+from pipeline.reconstruct.dipole import dipole_reflectance, fit_dipole, fit_dipole_laser
+from pipeline.reconstruct.disco2004 import distribute, fill, neighbours, resample_2004
+from pipeline.reconstruct.harmonics import harmonics
+from pipeline.reconstruct.lambertian import fit_lambertian
+from pipeline.reconstruct.mesh import interpolation, vertex_areas
+from pipeline.reconstruct.methods import METHODS, reconstruct
+from pipeline.reconstruct.needs import colour_groups, is_opaque
+from pipeline.reconstruct.profile import fit_profile, scatter
+
+
+def rmse_log10(model: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.sqrt((np.log10(model / truth) ** 2).mean()))
+
+
+@pytest.fixture(scope="module")
+def small():  # type: ignore[no-untyped-def]
+    return make(subdivisions=2, spots=80)
+
+
+@pytest.fixture(scope="module")
+def field(small):  # type: ignore[no-untyped-def]
+    s = small.samples
+    to_spots = interpolation(s.mesh, s.spots.triangle, s.spots.barycentric)
+    return SymmetricField.of(harmonics(s.mesh, 500), to_spots, 3.0)
+
+
+def test_solve_agrees_with_the_dense_normal_equations(small, field) -> None:  # type: ignore[no-untyped-def]
+    """Rationale: the plain float64 solution of the same least squares, unknown by unknown."""
+    rng = np.random.default_rng(1)
+    n = 12
+    cut = SymmetricField(field.vertices[:, :n], field.spots[:, :n], field.penalty[:n, :n])
+    shape = (len(cut.spots), len(cut.vertices))
+    target, weight, scale = rng.standard_normal(shape), rng.uniform(0, 2, shape), rng.uniform(0.1, 1, shape)
+    weight[rng.random(shape) < 0.3] = 0.0
+    u, b = cut.vertices.astype(float), cut.spots.astype(float)
+    design = np.einsum("si,vj->svij", b, u).reshape(-1, n * n)
+    pairs = [(i, j) for i in range(n) for j in range(i + 1)]
+    to_full = np.zeros((n * n, len(pairs)))
+    for k, (i, j) in enumerate(pairs):
+        to_full[i * n + j, k] = to_full[j * n + i, k] = 1.0
+    x = (design * scale.reshape(-1, 1)) @ to_full
+    penalty = to_full.T @ (cut.penalty.astype(float).ravel()[:, None] * to_full)
+    normal = x.T @ (weight.reshape(-1, 1) * x) + penalty
+    dense = to_full @ np.linalg.solve(normal, x.T @ (weight * target).ravel())
+    y = cut.solve(target, weight, scale, np.zeros((n, n), np.float32))
+    assert np.abs(y.ravel() - dense).max() < 0.03 * np.abs(dense).max()
+    np.testing.assert_allclose(y, y.T)
+
+
+def test_completes_what_was_not_measured(small) -> None:  # type: ignore[no-untyped-def]
+    """Expected behaviour: entries without any sample near them come out nearly as well as measured ones."""
+    model = complete(small.samples)
+    r = model.reflectance[0]
+    np.testing.assert_array_equal(r, r.T)
+    assert (r > 0).all()
+    assert 0.3 < model.measured.mean() < 0.95
+    for part in (model.measured, ~model.measured):
+        assert rmse_log10(r[part], small.truth[0][part]) < 0.06
+    area = vertex_areas(small.samples.mesh)
+    ratio = (r @ area) / (small.truth[0] @ area)
+    assert abs(ratio.mean() - 1) < 0.02
+    assert ratio.std() < 0.06
+
+
+def test_variance_covers_the_error(small) -> None:  # type: ignore[no-untyped-def]
+    """Expected behaviour: errors are within a few of the stated deviations, and rarely beyond."""
+    model = complete(small.samples)
+    z = (model.reflectance[0] - small.truth[0]) / np.sqrt(model.variance[0])
+    assert np.sqrt((z**2).mean()) < 1.5
+    assert (np.abs(z) > 4).mean() < 0.01
+
+
+def test_measured_entries_are_not_overwritten(small, field) -> None:  # type: ignore[no-untyped-def]
+    """Rationale: at a spot the model may differ from a sample by the sample's noise and the scatter below the mesh's
+    resolution; the standardised difference is one at most in the mean, and no single one is far out.
+    """
+    s = small.samples
+    _, at_spots, _ = complete_laser(s, 0, field, np.zeros_like(field.penalty))
+    seen = np.isfinite(s.values[0])
+    noise = np.sqrt(s.variance[0][seen] + (scatter(s.spot_pairs.distance) * at_spots)[seen] ** 2)
+    z = (at_spots[seen] - s.values[0][seen]) / noise
+    assert np.sqrt((z**2).mean()) < 1.0
+    assert np.abs(z).max() < 5.0
+
+
+def test_a_spot_pulls_the_model_as_far_as_its_precision_says(small, field) -> None:  # type: ignore[no-untyped-def]
+    """Rationale: one spot's samples raised by half: precise, the model follows; said to be noisy, it does not."""
+    s = small.samples
+    spot = 11
+    raised = s.values.copy()
+    raised[:, spot] *= 1.5
+    noisy = s.noise_per_signal.copy()
+    noisy[:, spot] *= 1e5
+    zero = np.zeros_like(field.penalty)
+    base = complete_laser(s, 0, field, zero)[1][spot]
+    far = (s.spot_pairs.distance[spot] > 5) & np.isfinite(s.values[0, spot])
+    sure = complete_laser(replace(s, values=raised), 0, field, zero)[1][spot]
+    unsure = complete_laser(replace(s, values=raised, noise_per_signal=noisy), 0, field, zero)[1][spot]
+    assert np.log(sure / base)[far].mean() > 0.15
+    assert abs(np.log(unsure / base)[far].mean()) < 0.03
+
+
+def test_noisy_tails_do_not_bias() -> None:
+    """Rationale: tails drowned in noise, half of them negative; the old remedy (logarithms) fails here."""
+    made = make(noise=0.02, hidden=0.0)
+    rng = np.random.default_rng(3)
+    level = 3e-4  # of the order of the values at half a turn
+    values = made.samples.values + level * rng.standard_normal(made.samples.values.shape).astype(np.float32)
+    dark = np.full_like(values, level**2)
+    model = complete(replace(made.samples, values=values, dark_variance=dark))
+    distance = made.samples.vertex_pairs.distance
+    tail = distance > 10
+    assert (values[0][made.samples.spot_pairs.distance > 14] < 0).mean() > 0.2
+    assert abs(np.log(model.reflectance[0][tail].sum() / made.truth[0][tail].sum())) < 0.1
+
+
+def test_profile_is_recovered() -> None:
+    made = make(noise=0.0, contrast=0.0, hidden=0.0)
+    s = made.samples
+    from pipeline.reconstruct.completion import measured_of
+
+    profile = fit_profile(s.spot_pairs, measured_of(s, 0), float(s.mesh.edges_unique_length.mean()))
+    got = s.vertex_pairs.mean(profile)
+    assert rmse_log10(0.5 * (got + got.T), made.truth[0]) < 0.02
+
+
+def test_deviation_and_scatter_grow_with_distance() -> None:
+    d = np.linspace(0, 40, 50)
+    assert (np.diff(deviation(d)) >= 0).all()
+    assert (np.diff(scatter(d)) > 0).all()
+
+
+@pytest.mark.parametrize("absorption", [0.001, 0.1])
+def test_dipole_energy_and_fit(absorption: float) -> None:
+    """Rationale: the integral over the plane is Jensen's closed form; the fit returns what it was given."""
+    scattering, eta = 1.5, 1.3
+    r = np.geomspace(1e-4, 4e3, 200_000)
+    total = np.trapezoid(2 * np.pi * r * dipole_reflectance(r, scattering, absorption, eta), r)
+    inner = -1.440 / eta**2 + 0.710 / eta + 0.668 + 0.0636 * eta
+    boundary = (1 + inner) / (1 - inner)
+    albedo = scattering / (scattering + absorption)
+    root = np.sqrt(3 * (1 - albedo))
+    exact = albedo / 2 * (1 + np.exp(-4 / 3 * boundary * root)) * np.exp(-root)  # Jensen et al. 2001, eq. 15
+    assert total == pytest.approx(exact, rel=2e-3)
+    made = make(spots=40, noise=0.0, contrast=0.0, hidden=0.2)
+    kernel = made.samples.spot_pairs.mean(lambda d: dipole_reflectance(d, scattering, absorption, eta))
+    values = np.where(np.isfinite(made.samples.values), kernel, np.nan).astype(np.float32)
+    found = fit_dipole_laser(replace(made.samples, values=values), 0)
+    assert found == pytest.approx((scattering, absorption), rel=0.02)
+
+
+def test_dipole_model_depends_on_distance_alone(small) -> None:  # type: ignore[no-untyped-def]
+    model = fit_dipole(small.samples)
+    np.testing.assert_allclose(model.reflectance[0], model.reflectance[0].T, rtol=1e-6)
+
+
+def test_lambertian_albedo_is_the_energy_of_the_spots(small) -> None:  # type: ignore[no-untyped-def]
+    model = fit_lambertian(small.samples)
+    area = vertex_areas(small.samples.mesh)
+    albedo = np.diag(model.reflectance[0]) * area
+    assert np.count_nonzero(model.reflectance[0]) == len(area)
+    truth = small.truth[0] @ area
+    assert np.std(albedo / truth) < 0.08
+    assert albedo.mean() == pytest.approx(truth.mean(), rel=0.03)
+
+
+def test_2004_spots_count_for_their_triangles(small) -> None:  # type: ignore[no-untyped-def]
+    s = small.samples
+    one = replace(s, values=np.where(np.arange(80)[:, None] == 5, s.values, np.nan).astype(np.float32))
+    values, known = distribute(one, 0)
+    lit = s.mesh.faces[s.spots.triangle[5]]
+    assert set(np.flatnonzero(known.any(axis=1))) <= set(lit)
+    seen = np.isfinite(s.values[0, 5])
+    np.testing.assert_allclose(values[lit[0]][seen], s.values[0, 5][seen], rtol=1e-5)
+
+
+def test_2004_fill_is_stable_and_keeps_what_was_measured(small) -> None:  # type: ignore[no-untyped-def]
+    """Rationale: the explicit step shrinks with the edge; on a mesh with edges of very different length a constant one
+    diverges. A constant matrix is a fixed point.
+    """
+    mesh = small.samples.mesh.copy()
+    mesh.vertices[:20] *= 0.999 + 0.3 * np.random.default_rng(0).random((20, 1))
+    step = neighbours(np.asarray(mesh.vertices), np.asarray(mesh.edges_unique))
+    rng = np.random.default_rng(2)
+    size = len(mesh.vertices)
+    known = rng.random((size, size)) < 0.3
+    np.fill_diagonal(known, rng.random(size) < 0.5)
+    values = np.where(known, rng.random((size, size)), 0.0)
+    out = fill(values, known, step)
+    np.testing.assert_allclose(out, out.T)
+    assert out.min() >= 0
+    assert out.max() <= 1
+    only = known & ~known.T
+    np.testing.assert_allclose(out[only], values[only])
+    np.testing.assert_allclose(fill(np.where(known, 0.5, 0.0), known | known.T, step)[known & known.T], 0.5)
+
+
+def test_2004_is_the_weaker_method(small) -> None:  # type: ignore[no-untyped-def]
+    theirs, ours = resample_2004(small.samples).reflectance[0], complete(small.samples).reflectance[0]
+    assert rmse_log10(np.maximum(theirs, 1e-9), small.truth[0]) > 2 * rmse_log10(ours, small.truth[0])
+
+
+def test_equal_wavelengths_are_solved_once_and_nothing_changes() -> None:
+    """Rationale: leaving a wavelength out that equals another is forced on; the model is the same bits."""
+    made = make(spots=40)
+    double = replace(
+        made.samples,
+        values=np.repeat(made.samples.values, 2, axis=0),
+        dark_variance=np.repeat(made.samples.dark_variance, 2, axis=0),
+        noise_per_signal=np.repeat(made.samples.noise_per_signal, 2, axis=0),
+    )
+    assert colour_groups(double) == [0, 0]
+    assert colour_groups(make(spots=40, lasers=2).samples) == [0, 1]
+    model = reconstruct(double, METHODS["default"])
+    np.testing.assert_array_equal(model.reflectance[0], model.reflectance[1])
+    forced = complete(double)  # both solved; the second starts from the first and stops a little further on
+    np.testing.assert_allclose(model.reflectance[1], forced.reflectance[1], rtol=0.05)
+
+
+def test_opaque_objects_have_no_global_term() -> None:
+    made = make(spots=60, noise=0.0)
+    local = made.samples.spot_pairs.mean(lambda d: np.exp(-d / 0.1) + 1e-12)
+    values = np.where(np.isfinite(made.samples.values), local, np.nan).astype(np.float32)
+    opaque = replace(made.samples, values=values)
+    assert is_opaque(opaque)
+    assert not is_opaque(made.samples)
+    model = reconstruct(opaque, METHODS["default"])
+    assert np.count_nonzero(model.reflectance[0]) == len(model.mesh.vertices)
+
+
+def test_measured_entries_come_in_pairs(small) -> None:  # type: ignore[no-untyped-def]
+    entries = measured_entries(small.samples)
+    np.testing.assert_array_equal(entries, entries.T)

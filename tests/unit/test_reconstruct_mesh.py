@@ -1,0 +1,124 @@
+"""Hat areas, rays, Laplacian and averaged kernels against exact answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from pipeline.reconstruct.distances import hat_points, spot_pairs, vertex_pairs
+from pipeline.reconstruct.harmonics import harmonics
+from pipeline.reconstruct.mesh import first_hit, stiffness, vertex_areas
+from pipeline.reconstruct.spots import Spots
+
+
+def plane(n: int = 24, edge: float = 1.0) -> trimesh.Trimesh:
+    """A flat patch of equilateral triangles."""
+    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    points = np.column_stack([(i + 0.5 * (j % 2)).ravel() * edge, j.ravel() * edge * np.sqrt(3) / 2, np.zeros(n * n)])
+    faces = []
+    for a in range(n - 1):
+        for b in range(n - 1):
+            p, q, r, s = a * n + b, (a + 1) * n + b, a * n + b + 1, (a + 1) * n + b + 1
+            faces += [[p, q, s], [p, s, r]] if b % 2 else [[p, q, r], [q, s, r]]
+    return trimesh.Trimesh(points, faces, process=False)
+
+
+def middle_of(mesh: trimesh.Trimesh) -> int:
+    return int(np.argmin(np.linalg.norm(mesh.vertices - mesh.vertices.mean(axis=0), axis=1)))
+
+
+def one_spot(mesh: trimesh.Trimesh, radius: float, tilt_deg: float = 0.0) -> Spots:
+    at = mesh.vertices[[middle_of(mesh)]] + [[1e-3, 2e-3, 0]]
+    hit = first_hit(mesh, np.add(at, [[0, 0, 5.0]]), np.array([[0, 0, -1.0]]))
+    tilt = np.deg2rad(tilt_deg)
+    direction = np.array([[np.sin(tilt), 0.0, -np.cos(tilt)]])
+    return Spots(at, direction, np.array([[0, 0, 1.0]]), hit.triangle, hit.barycentric, np.ones(1), radius)
+
+
+def test_rays_hit_where_they_should() -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=5.0)
+    hit = first_hit(mesh, np.array([[20.0, 0, 0], [20, 9, 0]]), np.array([[-1.0, 0, 0], [-1, 0, 0]]))
+    assert hit.triangle[0] >= 0
+    assert hit.triangle[1] == -1
+    assert hit.distance[0] == pytest.approx(15.0, abs=0.05)
+    assert hit.barycentric[0].sum() == pytest.approx(1.0)
+
+
+def test_stiffness_integrates_the_gradient() -> None:
+    """Rationale: for a linear function, u K u is |grad u|^2 times the area, exactly."""
+    mesh = plane()
+    u = np.asarray(mesh.vertices) @ [2.0, -1.0, 0.0]
+    assert u @ (stiffness(mesh) @ u) == pytest.approx(5.0 * mesh.area, rel=1e-12)
+
+
+def test_harmonics_of_the_sphere() -> None:
+    """Rationale: eigenvalues on a sphere of radius r are l (l + 1) / r^2, 2 l + 1 times each."""
+    found = harmonics(trimesh.creation.icosphere(subdivisions=3, radius=10.0), 9).eigenvalues * 100.0
+    np.testing.assert_allclose(found, [0] + [2] * 3 + [6] * 5, atol=0.06)
+
+
+def test_hat_weights_average_exactly() -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=10.0)
+    parts = hat_points(mesh, 3)
+    per_vertex = np.bincount(parts.vertices.ravel(), parts.weights.ravel())
+    np.testing.assert_allclose(per_vertex, 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("length", [0.7, 1.5, 3.0])
+def test_averaging_conserves_energy(length: float) -> None:
+    """Rationale: the integral of a kernel over the plane is the same whatever it is averaged over."""
+    mesh = plane(28)
+    area = vertex_areas(mesh)
+
+    def kernel(d):  # type: ignore[no-untyped-def]
+        return np.exp(-d / length) / (2 * np.pi * length**2)
+
+    if length < 2:
+        total = spot_pairs(mesh, one_spot(mesh, 0.4)).mean(kernel)[0] @ area
+        assert total == pytest.approx(1.0, rel=0.02)
+    total = vertex_pairs(mesh).mean(kernel)[middle_of(mesh)] @ area
+    assert total == pytest.approx(1.0, rel=0.02 if length < 2 else 0.15)  # a wide kernel leaves the patch
+
+
+def test_mean_of_a_gaussian_is_the_wider_gaussian() -> None:
+    """Rationale: second moments add: beam (r^2/4 per axis) and hat (edge^2 / 8 per axis)."""
+    mesh = plane(28)
+    spots = one_spot(mesh, 1.0)
+    pairs = spot_pairs(mesh, spots)
+    variance = 4.0
+    wide = variance + 0.25 + 1 / 8
+    got = pairs.mean(lambda d: np.exp(-(d**2) / (2 * variance)))[0]
+    exact = variance / wide * np.exp(-(pairs.distance[0] ** 2) / (2 * wide))
+    near = pairs.distance[0] < 3.9
+    np.testing.assert_allclose(got[near], exact[near], rtol=0.005)
+
+
+@pytest.mark.parametrize("length", [0.8, 2.0])
+def test_far_pairs_continue_near_ones(length: float) -> None:
+    """Rationale: an exponential averaged by histogram and by second moments, on either side of the limit."""
+    mesh = plane()
+    pairs = vertex_pairs(mesh)
+    row = pairs.distance[middle_of(mesh)]
+
+    def kernel(d):  # type: ignore[no-untyped-def]
+        return np.exp(-d / length)
+
+    gain = pairs.mean(kernel)[middle_of(mesh)] / kernel(row)
+    below, above = (row > 3.4) & (row < 3.99), (row > 4.01) & (row < 4.7)
+    assert gain[below].mean() == pytest.approx(gain[above].mean(), rel=0.03)
+
+
+def test_an_oblique_beam_is_longer() -> None:
+    mesh = plane(28)
+    straight, oblique = (spot_pairs(mesh, one_spot(mesh, 2.0, tilt)) for tilt in (0.0, 60.0))
+
+    def square(d):  # type: ignore[no-untyped-def]
+        return d**2 + 1e-6
+
+    centre = middle_of(mesh)
+    row = [np.flatnonzero(p.second == centre)[0] for p in (straight, oblique)]
+    a, b = (float((p.histogram[[r]] @ square(p.centres))[0]) for p, r in zip((straight, oblique), row, strict=True))
+    hat = 2 / 8
+    assert (a - hat) == pytest.approx(2.0, rel=0.08)  # r^2 / 2
+    assert (b - hat) == pytest.approx(5.0, rel=0.08)  # r^2 / 4 (1 + 1 / cos^2)
