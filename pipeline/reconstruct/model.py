@@ -71,7 +71,7 @@ class ReflectanceModel:
         """Read what `save` wrote; anything else is refused in one line."""
         remedy = "reconstruct again with this version"
         try:
-            with np.load(path, allow_pickle=False) as data:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
                 head = json.loads(str(data["head"]))
                 arrays = {name: data[name] for name in _ARRAYS}
         except OSError as error:
