@@ -126,7 +126,7 @@ def complete_laser(samples: Samples, laser: int, field: SymmetricField, start: F
             relative, weight = measured.residual(prior * np.exp(scale * fit), pairs.distance)
             y = field.solve(relative + scale * fit, weight, scale, y)
             fit = field.at_spots(y).astype(np.float64)
-    kernel = vertex_pairs.mean(profile)
+    kernel = vertex_pairs.mean(fit_profile(pairs, measured, edge, scale * fit, samples.tilt))
     exponent = deviation(vertex_pairs.distance) * (field.vertices @ y @ field.vertices.T)
     complete = 0.5 * (kernel + kernel.T) * np.exp(0.5 * (exponent + exponent.T))
     return complete, prior * np.exp(scale * fit), y

@@ -93,26 +93,43 @@ def _start(profile: Profile, measured: Measured, distance: F64) -> F64:
     return np.asarray(np.linalg.solve(basis.T @ basis + 1e-2 * bend.T @ bend, basis.T @ np.array(level)))
 
 
-def fit_profile(pairs: Pairs, measured: Measured, edge: float, offset: F64 | float = 0.0) -> Profile:
-    """Fit f so that exp(offset) * (mean of f over the pairs' patches) meets the values; offset is (S, V) or 0."""
+def _tilt_basis(tilt: F64, distance: F64, edge: float) -> F64:
+    """(S, V, 4) the tilt, times hat functions of log distance."""
+    knots = np.log(edge * np.array([0.5, 2.0, 4.5, 10.0]))
+    at = np.log(np.maximum(distance, 0.1 * edge))
+    return np.stack([np.interp(at, knots, one) * tilt for one in np.eye(len(knots))], axis=-1)
+
+
+def fit_profile(
+    pairs: Pairs, measured: Measured, edge: float, offset: F64 | float = 0.0, tilt: F64 | None = None
+) -> Profile:
+    """Fit f so that exp(offset) * (mean of f over the pairs' patches) meets the values; offset is (S, V) or 0.
+
+    Light that has not lost its direction leaves ahead: more is seen along its way than against it, and on a convex
+    object cameras look against it. With the samples' `tilt` (S, V) a factor exp(b(distance) * tilt) is fitted too and
+    left out of f, which then is the mean over all directions.
+    """
     knots = _knots(edge, float(pairs.distance.max()) * 1.01)
     profile = Profile(knots, np.zeros(len(knots) - 4))
     profile = Profile(knots, _start(profile, measured, pairs.distance))
     near_basis, basis = profile.basis(pairs.centres), profile.basis(pairs.distance)
-    bend = np.diff(np.eye(basis.shape[2]), 2, axis=0)
-    stiff = bend.T @ bend
+    n = basis.shape[2]
+    slopes = np.zeros((*pairs.distance.shape, 0)) if tilt is None else _tilt_basis(tilt, pairs.distance, edge)
+    factor = np.zeros(slopes.shape[2])
+    bend = np.diff(np.eye(n), 2, axis=0)
+    stiff = np.eye(n + len(factor))
+    stiff[:n, :n] = bend.T @ bend
     for _ in range(ITERATIONS):
         expected = pairs.mean(profile)
         jacobian = basis.copy()
         slope = pairs.histogram @ (profile(pairs.centres)[:, None] * near_basis)
         jacobian[pairs.first, pairs.second] = slope / expected[pairs.first, pairs.second][:, None]
-        relative, weight = measured.residual(expected * np.exp(offset), pairs.distance)
-        flat, w = jacobian.reshape(-1, basis.shape[2]), weight.ravel()
-        step = np.linalg.solve(
-            (flat * w[:, None]).T @ flat + stiff, flat.T @ (w * relative.ravel()) - stiff @ profile.coefficients
-        )
+        relative, weight = measured.residual(expected * np.exp(offset + slopes @ factor), pairs.distance)
+        flat, w = np.concatenate([jacobian, slopes], axis=2).reshape(-1, len(stiff)), weight.ravel()
+        now = np.concatenate([profile.coefficients, factor])
+        step = np.linalg.solve((flat * w[:, None]).T @ flat + stiff, flat.T @ (w * relative.ravel()) - stiff @ now)
         step *= min(1.0, 2.0 / np.abs(step).max())
-        profile = Profile(knots, profile.coefficients + step)
+        profile, factor = Profile(knots, now[:n] + step[:n]), now[n:] + step[n:]
         if np.abs(step).max() < 1e-3:
             break
     return profile

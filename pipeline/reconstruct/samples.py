@@ -23,7 +23,7 @@ from pipeline.capture.plan import ImageAddress, Plan
 from pipeline.capture.stream import CorruptImage, StreamReader
 from pipeline.reconstruct.distances import Pairs, spot_pairs, vertex_pairs
 from pipeline.reconstruct.settings import ReconstructConfig
-from pipeline.reconstruct.spots import Spots, locate_spots
+from pipeline.reconstruct.spots import Spots, locate_spots, outward_tilt
 from pipeline.reconstruct.views import Reading
 
 F64 = NDArray[np.float64]
@@ -54,6 +54,7 @@ class Samples:
 
     values: (L, S, V) mm^-2, NaN where not observed; averaged over the hat function of the vertex and over the beam
     dark_variance, noise_per_signal: (L, S, V); an entry of expectation m has variance dark + per_signal * m
+    tilt: (S, V) sum of `outward_tilt` at both ends, mean over the cameras
     glow: per view, images summed over its spots
     """
 
@@ -63,6 +64,7 @@ class Samples:
     values: F32
     dark_variance: F32
     noise_per_signal: F32
+    tilt: F64
     glow: tuple[Glow, ...] = ()
 
     @property
@@ -141,16 +143,21 @@ class _Gathered:
     def combined(self, mesh: trimesh.Trimesh, eta: float, spots: Spots, glow: tuple[Glow, ...]) -> Samples:
         """One value per laser, spot and vertex: the cameras' mean, by share of the footprint seen and view cosine."""
         weight = np.zeros(self.value.shape[1:], np.float32)  # (S, C, V)
+        tilt = np.zeros_like(weight)
         for view, reading in enumerate(self.readings):
             rows = self.plan.spots_at(self.plan.angle_of(view))
-            weight[rows.start : rows.stop, self.plan.camera_of(view)] = reading.share * reading.cosine
+            at = np.s_[rows.start : rows.stop, self.plan.camera_of(view)]
+            weight[at] = reading.share * reading.cosine
+            at_vertices, at_spots = outward_tilt(mesh, spots, glow[view].camera.position)
+            tilt[at] = (at_vertices + at_spots)[rows.start : rows.stop]
+        tilt = (weight * tilt).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-9)
         weight = np.where(np.isfinite(self.value), weight, 0.0).astype(np.float32)
         total = weight.sum(axis=2)
         norm = np.where(total > 0, total, np.nan)
         value = np.where(weight > 0, weight * self.value, 0.0).sum(axis=2) / norm
         dark = (weight**2 * self.dark).sum(axis=2) / norm**2
         slope = (weight**2 * self.noise_per_signal()).sum(axis=2) / norm**2
-        return Samples(mesh, eta, spots, value, dark, slope, glow)
+        return Samples(mesh, eta, spots, value, dark, slope, tilt.astype(np.float64), glow)
 
 
 def take_samples(

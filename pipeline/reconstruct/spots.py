@@ -47,3 +47,22 @@ def locate_spots(mesh: trimesh.Trimesh, calibration: Calibration, plan: Plan, se
     transmitted = np.where(used, transmittance(cosine, settings.eta), 0.0)
     radius = calibration.projectors[0].beam_diameter_mm / 2
     return Spots(position, direction, normal, triangle, barycentric, transmitted, radius)
+
+
+def outward_tilt(mesh: trimesh.Trimesh, spots: Spots, eye: F64) -> tuple[F64, F64]:
+    """How much one looks along the light's way: (S, V) at the vertices for a camera at `eye`, (S, V) at the spots.
+
+    At a vertex: component of the direction to the camera along the tangent that points away from the spot. At a spot,
+    the same with the roles exchanged: component of the direction to the laser along the tangent away from the vertex.
+    """
+    points, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
+    way = points[None] - spots.position[:, None]
+
+    def along(tangent_of: F64, normal: F64, towards: F64) -> F64:
+        tangent = tangent_of - (tangent_of * normal).sum(axis=2, keepdims=True) * normal
+        length = np.maximum(np.linalg.norm(tangent, axis=2), 1e-9)
+        return np.asarray((tangent * towards).sum(axis=2) / length)
+
+    to_eye = eye - points
+    to_eye /= np.linalg.norm(to_eye, axis=1, keepdims=True)
+    return along(way, normals[None], to_eye[None]), along(-way, spots.normal[:, None], -spots.direction[:, None])

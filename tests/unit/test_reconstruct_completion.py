@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from reconstruct_synthetic import make
 
-from pipeline.reconstruct.completion import SymmetricField, complete, complete_laser, deviation, measured_entries
+from pipeline.reconstruct.completion import (
+    SymmetricField,
+    complete,
+    complete_laser,
+    deviation,
+    measured_entries,
+    measured_of,
+)
 from pipeline.reconstruct.dipole import dipole_reflectance, fit_dipole, fit_dipole_laser
 from pipeline.reconstruct.disco2004 import distribute, fill, neighbours, resample_2004
 from pipeline.reconstruct.harmonics import harmonics
@@ -17,6 +24,7 @@ from pipeline.reconstruct.mesh import interpolation, vertex_areas
 from pipeline.reconstruct.methods import METHODS, reconstruct
 from pipeline.reconstruct.needs import colour_groups, is_opaque
 from pipeline.reconstruct.profile import fit_profile, scatter
+from pipeline.reconstruct.spots import outward_tilt
 
 
 def rmse_log10(model: np.ndarray, truth: np.ndarray) -> float:
@@ -128,8 +136,6 @@ def test_noisy_tails_do_not_bias() -> None:
 def test_profile_is_recovered() -> None:
     made = make(noise=0.0, contrast=0.0, hidden=0.0)
     s = made.samples
-    from pipeline.reconstruct.completion import measured_of
-
     profile = fit_profile(s.spot_pairs, measured_of(s, 0), float(s.mesh.edges_unique_length.mean()))
     got = s.vertex_pairs.mean(profile)
     assert rmse_log10(0.5 * (got + got.T), made.truth[0]) < 0.02
@@ -242,3 +248,35 @@ def test_opaque_objects_have_no_global_term() -> None:
 def test_measured_entries_come_in_pairs(small) -> None:  # type: ignore[no-untyped-def]
     entries = measured_entries(small.samples)
     np.testing.assert_array_equal(entries, entries.T)
+
+
+def test_profile_is_that_of_all_directions() -> None:
+    """Rationale: samples brighter where one looks along the light's way; the tilted fit takes it out again."""
+    made = make(noise=0.0, contrast=0.0, hidden=0.0)
+    s = made.samples
+    tilt = np.random.default_rng(4).uniform(-0.8, 0.2, s.values[0].shape)
+    edge = float(s.mesh.edges_unique_length.mean())
+    seen = measured_of(replace(s, values=s.values * np.exp(0.5 * tilt).astype(np.float32)), 0)
+    plain, tilted = (
+        s.vertex_pairs.mean(fit_profile(s.spot_pairs, seen, edge, tilt=t)).sum() / made.truth[0].sum()
+        for t in (None, tilt)
+    )
+    assert plain < 0.9
+    assert tilted == pytest.approx(1.0, abs=0.01)
+
+
+def test_tilt_has_the_sign_of_the_view() -> None:
+    """Rationale: a camera far away along x sees the light of a spot at the pole of z along its way on the +x side."""
+    s = make(spots=2).samples
+    pole = replace(
+        s.spots,
+        position=np.array([[0, 0, 10.0]] * 2),
+        normal=np.array([[0, 0, 1.0]] * 2),
+        direction=np.array([[0, 0, -1.0], [-0.6, 0, -0.8]]),  # the second laser stands on the +x side
+    )
+    at_vertices, at_spots = outward_tilt(s.mesh, pole, np.array([1e6, 0, 0]))
+    x, _, z = np.asarray(s.mesh.vertices).T
+    near = (z > 8) & (np.abs(x) > 2)
+    np.testing.assert_array_equal(np.sign(at_vertices[0, near]), np.sign(x[near]))
+    np.testing.assert_allclose(at_spots[0, near], 0.0, atol=1e-9)
+    np.testing.assert_array_equal(np.sign(at_spots[1, near]), -np.sign(x[near]))
