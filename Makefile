@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 OUT ?= out/quick
 
-.PHONY: demo test lint validate install picture clean
+.PHONY: demo test lint validate install references picture clean
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -13,7 +13,8 @@ help:
 	@echo "make demo      capture, reconstruct and relight scenes/quick.toml; the report lies in $(OUT)/report.html"
 	@echo "make test      the tests (minutes)"
 	@echo "make lint      style, types, import rules"
-	@echo "make validate  the slow tests as well"
+	@echo "make validate  the slow tests as well: the figures that quick must reach, among them"
+	@echo "make references  render the quick scene's reference images anew"
 	@echo "make picture   the README's picture, from the demo's run"
 
 install: $(READY)
@@ -38,6 +39,10 @@ lint: $(READY)
 
 validate: $(READY)
 	$(BIN)/python -m pytest -m "slow or not slow" --timeout 1800
+
+# After a change of the quick scene's object, lights or held-out views, and then commit them.
+references: $(READY)
+	$(BIN)/disco-twin reference scenes/quick.toml --out scenes/references/quick
 
 picture: $(READY)
 	$(BIN)/python -m disco_twin.picture $(OUT) docs/picture.png
