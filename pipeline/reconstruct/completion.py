@@ -20,7 +20,6 @@ from scipy import sparse
 
 from pipeline.reconstruct.exitance import measure_boundary
 from pipeline.reconstruct.harmonics import Harmonics, harmonics
-from pipeline.reconstruct.mesh import interpolation
 from pipeline.reconstruct.model import ReflectanceModel
 from pipeline.reconstruct.profile import Measured, fit_profile, scatter
 from pipeline.reconstruct.samples import Samples
@@ -36,6 +35,7 @@ ROUNDS = 2  # of Gauss-Newton, for each of as many fits of the profile
 TOLERANCE = 1e-2  # of conjugate gradients; every solve starts from the one before
 MOST_STEPS = 300
 MOST_HARMONICS = 500
+LIT = 0.03  # share of a beam's power on a hat function that makes its vertex lit
 
 
 def deviation(distance: F64) -> F64:
@@ -119,14 +119,15 @@ def complete_laser(samples: Samples, laser: int, field: SymmetricField, start: F
     edge = float(samples.mesh.edges_unique_length.mean())
     scale, y = deviation(pairs.distance), start
     fit = field.at_spots(y).astype(np.float64)
+    profile = None
     for _ in range(ROUNDS):
-        profile = fit_profile(pairs, measured, edge, scale * fit)
+        profile = fit_profile(pairs, measured, edge, scale * fit, start=profile)
         prior = pairs.mean(profile)
         for _ in range(ROUNDS):
             relative, weight = measured.residual(prior * np.exp(scale * fit), pairs.distance)
             y = field.solve(relative + scale * fit, weight, scale, y)
             fit = field.at_spots(y).astype(np.float64)
-    kernel = vertex_pairs.mean(fit_profile(pairs, measured, edge, scale * fit, samples.tilt))
+    kernel = vertex_pairs.mean(fit_profile(pairs, measured, edge, scale * fit, samples.tilt, profile))
     exponent = deviation(vertex_pairs.distance) * (field.vertices @ y @ field.vertices.T)
     complete = 0.5 * (kernel + kernel.T) * np.exp(0.5 * (exponent + exponent.T))
     return complete, prior * np.exp(scale * fit), y
@@ -139,7 +140,7 @@ def unexplained(samples: Samples, basis: Harmonics, range_mm: float) -> F64:
     """
     covariance = basis.covariance(range_mm)
     used = samples.spots.transmitted > 0
-    to_spots = interpolation(samples.mesh, samples.spots.triangle[used], samples.spots.barycentric[used])
+    to_spots = samples.lit[np.flatnonzero(used)]
     cross = to_spots @ covariance  # (S, V)
     noise = (scatter(np.zeros(1)) / NEAR) ** 2
     gain = np.linalg.solve(cross @ to_spots.T + noise * np.eye(len(cross)), cross)
@@ -151,20 +152,19 @@ def unexplained(samples: Samples, basis: Harmonics, range_mm: float) -> F64:
 
 
 def measured_entries(samples: Samples) -> NDArray[np.bool_]:
-    """(V, V) entries next to a sample: a spot lies in a triangle at one vertex and the other vertex was observed."""
-    used = np.flatnonzero(samples.spots.transmitted > 0)
-    out = np.zeros((len(samples.mesh.vertices),) * 2, bool)
-    for spot in used:
-        out[samples.mesh.faces[samples.spots.triangle[spot]]] |= np.isfinite(samples.values[:, spot]).all(axis=0)
-    return out | out.T
+    """(V, V) entries that a sample is part of: a beam that lights the one vertex's hat, and the other one observed."""
+    used = samples.spots.transmitted > 0
+    lit = (samples.lit[used].toarray() > LIT).astype(np.float32)
+    seen = np.isfinite(samples.values[:, used]).all(axis=0).astype(np.float32)
+    out = lit.T @ seen > 0
+    return np.asarray(out | out.T)
 
 
 def complete(samples: Samples) -> ReflectanceModel:
     """The default method: samples -> model."""
     range_mm = RANGE_MM_PER_EDGE * float(samples.mesh.edges_unique_length.mean())
     basis = harmonics(samples.mesh, MOST_HARMONICS)
-    to_spots = interpolation(samples.mesh, samples.spots.triangle, samples.spots.barycentric)
-    field = SymmetricField.of(basis, to_spots, range_mm)
+    field = SymmetricField.of(basis, samples.lit, range_mm)
     y, found, at_spots = np.zeros_like(field.penalty), [], []
     for laser in range(len(samples.values)):
         entries, at_spot, y = complete_laser(samples, laser, field, y)

@@ -19,7 +19,7 @@ from pipeline.reconstruct.samples import Samples
 F64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-ITERATIONS = 100
+ITERATIONS = 150
 STEP = 0.9  # of the largest stable one
 
 
@@ -63,14 +63,14 @@ def fill(values: F64, known: Bool, step: sparse.csr_array) -> F64:
     start = np.where(count > 0, (values + values.T) / np.maximum(count, 1.0), 0.0)
     fixed = count > 0
     lit = np.diag(fixed)
-    out = start.copy()
+    out, step = start.astype(np.float32), step.astype(np.float32)
     within = ~fixed & (lit[:, None] | lit[None, :])
-    for open_entries in (within, ~fixed):
+    for entries in (within, ~fixed):
+        open_entries = 0.5 * entries.astype(np.float32)
         for _ in range(ITERATIONS):
-            change = step @ out
-            out = out + np.where(open_entries, 0.5 * (change + (step @ out.T).T), 0.0)
-            out = 0.5 * (out + out.T)
-    return np.asarray(np.where(fixed, start, out))
+            change = step @ out  # out is symmetric: the same along rows is its transpose
+            out = out + open_entries * (change + change.T)
+    return np.asarray(np.where(fixed, start, out), np.float64)
 
 
 def resample_2004(samples: Samples) -> ReflectanceModel:

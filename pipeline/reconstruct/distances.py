@@ -18,7 +18,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from pipeline.reconstruct.mesh import vertex_areas
+from pipeline.reconstruct.mesh import first_hit, interpolation, vertex_areas
 from pipeline.reconstruct.spots import Spots
 
 F64 = NDArray[np.float64]
@@ -27,6 +27,7 @@ Kernel = Callable[[F64], F64]
 
 REACH = 4.0  # edges
 BINS_PER_EDGE = 25
+TABLE = 4096
 
 
 @dataclass(frozen=True)
@@ -47,11 +48,12 @@ class Pairs:
     def mean(self, kernel: Kernel) -> F64:
         """(N, V) mean of kernel(distance) over both patches; the kernel is positive."""
         # Far pairs: the kernel is locally exponential; its Laplacian in the plane over itself is slope^2 + slope / r.
+        # It is a function of distance alone, so a fine table of its logarithm serves all pairs.
+        table = np.linspace(0.0, float(self.distance.max()), TABLE)
         step = 0.04 * self.centres[-1]
-        ahead, behind = kernel(self.distance + step), kernel(np.maximum(self.distance - step, 0.0))
-        slope = np.log(ahead / behind) / (2 * step)
-        laplacian = slope**2 + slope / np.maximum(self.distance, step)
-        out = kernel(self.distance) * np.exp(0.5 * self.spread * np.minimum(laplacian, 1 / self.spread))
+        slope = np.log(kernel(table + step) / kernel(np.maximum(table - step, 0.0))) / (2 * step)
+        laplacian = np.minimum(slope**2 + slope / np.maximum(table, step), 1 / self.spread)
+        out = np.exp(np.interp(self.distance, table, np.log(kernel(table)) + 0.5 * self.spread * laplacian))
         out[self.first, self.second] = self.histogram @ kernel(self.centres)
         return np.asarray(out)
 
@@ -95,6 +97,24 @@ def beam_points(spots: Spots) -> F64:
     across = a[:, None] * (radius * np.cos(angle))[:, None] + b[:, None] * (radius * np.sin(angle))[:, None]
     slide = (across * n[:, None]).sum(axis=2) / np.minimum((d * n).sum(axis=1), -0.1)[:, None]
     return np.asarray(spots.position[:, None] + across - d[:, None] * slide[:, :, None])
+
+
+def lit_hats(mesh: trimesh.Trimesh, spots: Spots) -> sparse.csr_array:
+    """(S, V) mean of each vertex's hat function over a beam's footprint; rows add up to 1.
+
+    Rays that miss the scan at its outline count for the axis.
+    """
+    points = beam_points(spots)
+    count = points.shape[1]
+    direction = np.repeat(spots.direction, count, axis=0)
+    back = 4.0 * float(np.linalg.norm(mesh.extents))
+    hit = first_hit(mesh, points.reshape(-1, 3) - back * direction, direction)
+    missed = np.flatnonzero(hit.triangle < 0) // count
+    hit.triangle[hit.triangle < 0] = spots.triangle[missed]
+    hit.barycentric[hit.barycentric.sum(axis=1) == 0] = spots.barycentric[missed]
+    spot = np.repeat(np.arange(len(points)), count)
+    mean = sparse.csr_array((np.full(len(spot), 1.0 / count), (spot, np.arange(len(spot)))))
+    return sparse.csr_array(mean @ interpolation(mesh, hit.triangle, hit.barycentric))
 
 
 def _pairs(mesh: trimesh.Trimesh, centres: F64, patches: list[tuple[F64, F64]], spread: float) -> Pairs:

@@ -24,6 +24,7 @@ SCATTER_MM = 5.0
 OUTLIER = 3.0  # standard deviations from which on a value counts less (Huber)
 LARGEST_STEP = 2.0  # relative: what lies further from its expectation is taken to lie here
 ITERATIONS = 12
+ENOUGH = 3e-3  # change of log f at which the fit ends
 
 
 @dataclass(frozen=True)
@@ -101,17 +102,21 @@ def _tilt_basis(tilt: F64, distance: F64, edge: float) -> F64:
 
 
 def fit_profile(
-    pairs: Pairs, measured: Measured, edge: float, offset: F64 | float = 0.0, tilt: F64 | None = None
+    pairs: Pairs,
+    measured: Measured,
+    edge: float,
+    offset: F64 | float = 0.0,
+    tilt: F64 | None = None,
+    start: Profile | None = None,
 ) -> Profile:
     """Fit f so that exp(offset) * (mean of f over the pairs' patches) meets the values; offset is (S, V) or 0.
 
     Light that has not lost its direction leaves ahead: more is seen along its way than against it, and on a convex
     object cameras look against it. With the samples' `tilt` (S, V) a factor exp(b(distance) * tilt) is fitted too and
-    left out of f, which then is the mean over all directions.
+    left out of f, which then is the mean over all directions. `start` is a first guess.
     """
     knots = _knots(edge, float(pairs.distance.max()) * 1.01)
-    profile = Profile(knots, np.zeros(len(knots) - 4))
-    profile = Profile(knots, _start(profile, measured, pairs.distance))
+    profile = start or Profile(knots, _start(Profile(knots, np.zeros(len(knots) - 4)), measured, pairs.distance))
     near_basis, basis = profile.basis(pairs.centres), profile.basis(pairs.distance)
     n = basis.shape[2]
     slopes = np.zeros((*pairs.distance.shape, 0)) if tilt is None else _tilt_basis(tilt, pairs.distance, edge)
@@ -130,6 +135,6 @@ def fit_profile(
         step = np.linalg.solve((flat * w[:, None]).T @ flat + stiff, flat.T @ (w * relative.ravel()) - stiff @ now)
         step *= min(1.0, 2.0 / np.abs(step).max())
         profile, factor = Profile(knots, now[:n] + step[:n]), now[n:] + step[n:]
-        if np.abs(step).max() < 1e-3:
+        if np.abs(step).max() < ENOUGH:
             break
     return profile

@@ -14,14 +14,14 @@ from functools import cached_property
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, sparse
 
 from hw.record import RadianceImage
 from pipeline.calibrate.calibration import Calibration
 from pipeline.calibrate.camera import PinholeCamera
 from pipeline.capture.plan import ImageAddress, Plan
 from pipeline.capture.stream import CorruptImage, StreamReader
-from pipeline.reconstruct.distances import Pairs, spot_pairs, vertex_pairs
+from pipeline.reconstruct.distances import Pairs, lit_hats, spot_pairs, vertex_pairs
 from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.reconstruct.spots import Spots, locate_spots, outward_tilt
 from pipeline.reconstruct.views import Reading
@@ -76,6 +76,11 @@ class Samples:
     def spot_pairs(self) -> Pairs:
         """Distances between the beams and the hat functions."""
         return spot_pairs(self.mesh, self.spots)
+
+    @cached_property
+    def lit(self) -> sparse.csr_array:
+        """(S, V) mean of each vertex's hat function over a beam's footprint; rows add up to 1."""
+        return lit_hats(self.mesh, self.spots)
 
     @cached_property
     def vertex_pairs(self) -> Pairs:

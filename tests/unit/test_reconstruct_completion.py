@@ -20,7 +20,7 @@ from pipeline.reconstruct.dipole import dipole_reflectance, fit_dipole, fit_dipo
 from pipeline.reconstruct.disco2004 import distribute, fill, neighbours, resample_2004
 from pipeline.reconstruct.harmonics import harmonics
 from pipeline.reconstruct.lambertian import fit_lambertian
-from pipeline.reconstruct.mesh import interpolation, vertex_areas
+from pipeline.reconstruct.mesh import vertex_areas
 from pipeline.reconstruct.methods import METHODS, reconstruct
 from pipeline.reconstruct.needs import colour_groups, is_opaque
 from pipeline.reconstruct.profile import fit_profile, scatter
@@ -39,8 +39,7 @@ def small():  # type: ignore[no-untyped-def]
 @pytest.fixture(scope="module")
 def field(small):  # type: ignore[no-untyped-def]
     s = small.samples
-    to_spots = interpolation(s.mesh, s.spots.triangle, s.spots.barycentric)
-    return SymmetricField.of(harmonics(s.mesh, 500), to_spots, 3.0)
+    return SymmetricField.of(harmonics(s.mesh, 500), s.lit, 3.0)
 
 
 def test_solve_agrees_with_the_dense_normal_equations(small, field) -> None:  # type: ignore[no-untyped-def]
@@ -204,7 +203,7 @@ def test_2004_fill_is_stable_and_keeps_what_was_measured(small) -> None:  # type
     np.fill_diagonal(known, rng.random(size) < 0.5)
     values = np.where(known, rng.random((size, size)), 0.0)
     out = fill(values, known, step)
-    np.testing.assert_allclose(out, out.T)
+    np.testing.assert_allclose(out, out.T, rtol=1e-5)
     assert out.min() >= 0
     assert out.max() <= 1
     only = known & ~known.T
