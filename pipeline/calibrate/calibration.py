@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -119,11 +120,9 @@ class Calibration(Strict):
         return origins, directions
 
     def vignetting(self, view: int) -> F64:
-        """(H, W) relative illumination of the pixels by the lens, 1 on the optical axis."""
-        camera = self.view_camera(view)
-        xy = camera.undistort((camera.pixel_centres() - camera.centre) / camera.focal)
-        cosine = 1.0 / np.sqrt(1.0 + (xy**2).sum(axis=1))
-        return np.asarray(cosine.reshape(camera.height, camera.width) ** self.vignetting_exponent)
+        """(H, W) relative illumination of the pixels by the lens, 1 on the optical axis; read-only."""
+        v = self.views[view]
+        return _illumination(v.width, v.height, v.focal_px, v.centre_px, v.distortion, self.vignetting_exponent)
 
     def radiance(self, raw: RawImage, view: int, laser: int) -> RadianceImage:
         """(H, W) radiance in W/(mm^2 sr) with its variance, corrected for the lens's vignetting."""
@@ -150,6 +149,24 @@ class Calibration(Strict):
         if not isinstance(data, dict) or data.get("format_version") != 1:
             raise InputError("not a calibration of format version 1", file=path, remedy="calibrate again")
         return check(data, cls, path)
+
+
+@lru_cache(maxsize=32)
+def _illumination(
+    width: int,
+    height: int,
+    focal: tuple[float, float],
+    centre: tuple[float, float],
+    distortion: tuple[float, ...],
+    exponent: float,
+) -> F64:
+    """(H, W) cos^exponent of the angle off the axis. Kept: the views of a camera share it, and every image needs it."""
+    camera = PinholeCamera(width, height, np.array(focal), np.array(centre), np.array(distortion), np.eye(4))
+    xy = camera.undistort((camera.pixel_centres() - camera.centre) / camera.focal)
+    cosine = 1.0 / np.sqrt(1.0 + (xy**2).sum(axis=1))
+    gain = np.asarray(cosine.reshape(height, width) ** exponent)
+    gain.flags.writeable = False
+    return gain
 
 
 def _pose(matrix: F64) -> Pose:

@@ -80,6 +80,9 @@ def test_vignetting_is_cos4_of_the_angle_to_the_axis_and_is_divided_out(calibrat
     _, rays = camera.rays(np.array([[0.5, 0.5], [48.5, 32.5]]))
     cosine = rays @ camera.pose[2, :3]
     np.testing.assert_allclose([gain[0, 0], gain[32, 48]], cosine**4, rtol=1e-12)
+    assert calibration.vignetting(2) is gain  # computed once for the views of a camera
+    assert calibration.vignetting(3).shape == (48, 64)
+    assert not gain.flags.writeable
     raw = RawImage(np.full((64, 96), 3, np.uint8), np.full((64, 96), 1000, np.uint16))
     plain, corrected = to_radiance(raw, SENSOR, 1), calibration.radiance(raw, 0, 1)
     np.testing.assert_allclose(corrected.radiance * gain, plain.radiance, rtol=1e-6)
