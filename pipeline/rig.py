@@ -6,7 +6,7 @@ The pipeline is told this nominal rig and nothing else; the twin perturbs it (th
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -23,12 +23,24 @@ class LaserConfig(Strict):
     power_mw: Annotated[float, Field(gt=0, le=500)] = 10.0
 
 
-class ProjectorConfig(Strict):
+class Aimed(Strict):
+    """A device at a place, turned towards another; `up` is up in its image (see `calibrate.camera.look_at`)."""
+
+    position_mm: Point
+    aim_mm: Point = (0.0, 0.0, 0.0)
+    up: Point = (0.0, 0.0, 1.0)
+
+    @model_validator(mode="after")
+    def _looks_somewhere(self) -> Self:
+        if self.position_mm == self.aim_mm:
+            raise ValueError("position_mm equals aim_mm: aim at another point than the device's own place")
+        return self
+
+
+class ProjectorConfig(Aimed):
     """The two-mirror projector. `separation_mm` is the distance between the mirrors (0: a pinhole)."""
 
     position_mm: Point = (600.0, 0.0, 120.0)
-    aim_mm: Point = (0.0, 0.0, 0.0)
-    up: Point = (0.0, 0.0, 1.0)
     full_angle_deg: Annotated[float, Field(gt=0, le=90)] = 12.0
     steps: Annotated[int, Field(ge=2, le=65536)] = 4096
     separation_mm: Annotated[float, Field(ge=0, le=100)] = 12.0
@@ -36,13 +48,10 @@ class ProjectorConfig(Strict):
     beam_profile: Literal["gaussian", "uniform"] = "uniform"
 
 
-class CameraConfig(Strict):
+class CameraConfig(Aimed):
     """A camera. The principal point is the image centre; distortion is OpenCV's k1 k2 p1 p2 k3."""
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_-]+$", max_length=32)]
-    position_mm: Point
-    aim_mm: Point = (0.0, 0.0, 0.0)
-    up: Point = (0.0, 0.0, 1.0)
     width: Annotated[int, Field(ge=16, le=8192)] = 768
     height: Annotated[int, Field(ge=16, le=8192)] = 496
     focal_length_mm: Positive = 25.0

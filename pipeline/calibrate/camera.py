@@ -11,17 +11,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hw.errors import InputError
 from pipeline.rig import CameraConfig
 
 F64 = NDArray[np.float64]
 
 
 def look_at(position: ArrayLike, aim: ArrayLike, up: ArrayLike = (0, 0, 1)) -> F64:
-    """(4, 4) transform world -> device for a device at `position` with +z towards `aim`, x right, y down."""
+    """(4, 4) transform world -> device for a device at `position` with +z towards `aim`, x right, y down.
+
+    A device that looks straight along `up` (within 1e-6 rad) takes +y as up instead, or +x where it looks along y.
+    """
     eye = np.asarray(position, float)
     forward = np.asarray(aim, float) - eye
-    forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, np.asarray(up, float))
+    distance = np.linalg.norm(forward)
+    if distance == 0:
+        raise InputError("position and aim are one point", value=position, remedy="aim at another point")
+    forward = forward / distance
+    upward = np.asarray(up, float)
+    right = np.cross(forward, upward)
+    if np.linalg.norm(right) <= 1e-6 * np.linalg.norm(upward):
+        right = np.cross(forward, [0.0, 1.0, 0.0] if abs(forward[1]) < 0.9 else [1.0, 0.0, 0.0])
     right = right / np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     pose = np.eye(4)

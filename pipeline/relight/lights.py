@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from pipeline.config import Strict
-from pipeline.rig import Point, Positive
+from pipeline.rig import Aimed, Point, Positive
 
 
 def _not_zero(vector: Point) -> Point:
@@ -63,7 +63,7 @@ class Beam(Strict):
     colour: Colour = (1.0, 1.0, 1.0)
 
 
-class TexturedProjector(Strict):
+class TexturedProjector(Aimed):
     """A pinhole projector; intensity W/sr on the axis, falling with the cube of the cosine like a flat slide.
 
     Slide coordinates (a, b) are millimetres in the plane through `aim_mm` across the axis, a to the right and b down
@@ -73,9 +73,6 @@ class TexturedProjector(Strict):
 
     kind: Literal["projector"] = "projector"
     name: str = "projector"
-    position_mm: Point
-    aim_mm: Point = (0.0, 0.0, 0.0)
-    up: Point = (0.0, 0.0, 1.0)
     period_mm: Positive = 8.0
     contrast: Annotated[float, Field(ge=0, le=1)] = 1.0
     half_width_mm: Positive = 40.0

@@ -7,8 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hw.errors import InputError
 from pipeline.calibrate.camera import PinholeCamera, look_at, turn
 from pipeline.calibrate.projector import TwoMirrorProjector
+from pipeline.config import check
+from pipeline.relight.lights import TexturedProjector
 from pipeline.rig import CameraConfig, ProjectorConfig
 
 DISTORTION = (-0.18, 0.09, 0.002, -0.001, 0.03)
@@ -42,6 +45,35 @@ def test_look_at_is_a_rotation_with_its_axis_on_the_aim() -> None:
     np.testing.assert_allclose(pose @ [3, -4, 5, 1], [0, 0, 0, 1], atol=1e-14)
     np.testing.assert_allclose((pose @ [1, 1, 1, 1])[:2], 0, atol=1e-14)
     assert (pose @ [1, 1, 1, 1])[2] > 0
+
+
+@pytest.mark.parametrize(
+    ("position", "up", "image_up"),
+    [
+        ((0, 0, 9), (0, 0, 1), (0, 1, 0)),
+        ((0, 0, -9), (0, 0, 1), (0, 1, 0)),
+        ((0, 9, 0), (0, 2, 0), (1, 0, 0)),
+        ((9, 0, 0), (1, 0, 0), (0, 1, 0)),
+        ((9, 0, 0), (0, 0, 0), (0, 1, 0)),
+    ],
+)
+def test_looking_along_up_takes_another_axis(
+    position: tuple[float, ...], up: tuple[float, ...], image_up: tuple[float, ...]
+) -> None:
+    pose = look_at(position, (0, 0, 0), up)
+    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-15)
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
+    np.testing.assert_allclose(pose[:3, :3] @ image_up, [0, -1, 0], atol=1e-15)
+
+
+def test_nothing_looks_at_its_own_place() -> None:
+    with pytest.raises(InputError, match="Remedy: aim"):
+        look_at((1, 2, 3), (1, 2, 3))
+    here = {"position_mm": (1.0, 2.0, 3.0), "aim_mm": (1.0, 2.0, 3.0)}
+    for schema in (CameraConfig, ProjectorConfig, TexturedProjector):
+        name = {} if schema is ProjectorConfig else {"name": "c"}
+        with pytest.raises(InputError, match="position_mm equals aim_mm"):
+            check(here | name, schema, "scene.toml")
 
 
 def test_distortion_is_opencvs_by_hand() -> None:

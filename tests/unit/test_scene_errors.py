@@ -56,6 +56,11 @@ BAD = [
     ('name = "good"', 'name = "a/b"', ["name = 'a/b'", "pattern"]),
     ("format_version = 1", "format_version = 2", ["format_version = 2", "1"]),
     ("width = 192", "width = 3", ["rig.cameras[0].width = 3", ">= 16 and <= 8192"]),
+    (
+        'name = "c"\nposition_mm = [450.0, 0.0, 50.0]',
+        'name = "c"\nposition_mm = [0.0, 0.0, 0.0]',
+        ["relight.views[1]", "position_mm equals aim_mm", "aim at another point"],
+    ),
     ('name = "c"', 'name = "a"', ["relight.views and rig.cameras", "distinct"]),
     ("vertices = 642", "vertices = 20", ["scan.vertices = 20", ">= 50"]),
     ("vertices = 642", "vertices = 50\n[simulation]\ntruth_columns = 40", ["simulation.truth_columns = 40", "half"]),
