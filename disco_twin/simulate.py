@@ -15,10 +15,13 @@ from disco_twin.folder import RunFolder, write_atomically
 from disco_twin.world import World, reference_key
 from hw.errors import InputError
 from pipeline.calibrate.camera import PinholeCamera
+from pipeline.capture.sweep import sees
 from pipeline.relight.lights import Light
-from pipeline.rig import CameraConfig
+from pipeline.rig import CameraConfig, FaultsConfig
 
 if TYPE_CHECKING:
+    import trimesh
+
     from disco_twin.light.truth import Truth
     from pipeline.capture.loop import CaptureReport
 
@@ -33,9 +36,11 @@ def write_scan(world: World, capture: Path) -> None:
     from disco_twin.camera.lars3 import lars3_sensor
 
     _require_equal_sizes(world.scene.rig.cameras, "rig.cameras")
+    require_views_in_sight(world.scene.relight.views, world.scan)
     world.plan  # noqa: B018 - refuses a rig that cannot capture this object before anything is simulated
     write_atomically(capture / "scan.ply", bytes(world.scan.export(file_type="ply")))
-    write_atomically(capture / "rig.json", world.scene.rig.model_dump_json(indent=1).encode())
+    told = world.scene.rig.model_copy(update={"faults": FaultsConfig()})  # which faults are on is the twin's secret
+    write_atomically(capture / "rig.json", told.model_dump_json(indent=1).encode())
     sensor = asdict(lars3_sensor(world.scene.rig))
     write_atomically(capture / "sensor.json", json.dumps(sensor, indent=1).encode())
 
@@ -44,6 +49,18 @@ def _require_equal_sizes(cameras: Sequence[CameraConfig], key: str) -> None:
     sizes = {(c.width, c.height) for c in cameras}
     if len(sizes) > 1:
         raise InputError("the twin's cameras must have one image size", key=key, value=sorted(sizes))
+
+
+def require_views_in_sight(views: Sequence[CameraConfig], mesh: trimesh.Trimesh) -> None:
+    """Every held-out view must see something of the object, or there is nothing to score."""
+    for i, view in enumerate(views):
+        if not sees(view, 0.0, mesh):
+            raise InputError(
+                f"the held-out view {view.name!r} does not see the object",
+                key=f"relight.views[{i}]",
+                value=view.aim_mm,
+                remedy="point its aim_mm at the object, or check position_mm and focal_length_mm",
+            )
 
 
 def take_images(world: World, folder: RunFolder, progress: Progress) -> CaptureReport:

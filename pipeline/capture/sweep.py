@@ -128,7 +128,7 @@ def require_in_sight(rig: RigConfig, mesh: trimesh.Trimesh) -> None:
     """Every camera must see something of the object at every turntable angle."""
     for config in rig.cameras:
         for degrees in rig.turntable_angles_deg:
-            if not _sees(config, np.deg2rad(degrees), mesh):
+            if not sees(config, np.deg2rad(degrees), mesh):
                 raise InputError(
                     f"the camera does not see the object at turntable angle {degrees:g} deg",
                     key=f"rig.cameras.{config.name}.aim_mm",
@@ -137,7 +137,8 @@ def require_in_sight(rig: RigConfig, mesh: trimesh.Trimesh) -> None:
                 )
 
 
-def _sees(config: CameraConfig, angle_rad: float, mesh: trimesh.Trimesh) -> bool:
+def sees(config: CameraConfig, angle_rad: float, mesh: trimesh.Trimesh) -> bool:
+    """Whether a camera has something of the object in its image at a turntable angle."""
     camera = PinholeCamera.from_config(config).seen_from(turn(angle_rad))
     pixel, depth = camera.project(np.asarray(mesh.vertices, float))
     inside = ((pixel > 0) & (pixel < [camera.width, camera.height])).all(axis=1)
