@@ -186,7 +186,7 @@ def light_error_figure(relit: Sequence[Mapping[str, Any]], methods: Sequence[str
     lights = list(dict.fromkeys(str(r["light"]) for r in relit))
     figure, axis = new_figure(7.2, 0.36 * len(lights) + 1.0)
     for offset, method in zip(np.linspace(-0.24, 0.24, max(len(methods), 2)), methods, strict=False):
-        rows = [r for r in relit if r["method"] == method]
+        rows = [r for r in relit if r["method"] == method and r["nrmse"] is not None]
         x = np.array([max(float(r["nrmse"]), 1e-3) for r in rows])
         y = np.array([lights.index(r["light"]) for r in rows]) + offset
         error = np.array([float(r["nrmse_se"]) for r in rows])

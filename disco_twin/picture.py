@@ -20,7 +20,7 @@ def main(run: Path, target: Path) -> None:
     opened = reopen_run(run, None, Console())
     summary = load_summary(opened.folder.summary_file)
     method = summary["method"]
-    spots = [row[0] for row in impulses(opened.world, opened.folder.capture)]
+    spots = [row[0] for row in impulses(opened.scene.rig, opened.folder.capture)[0]]
     found = comparisons(opened.world, opened.folder, [method], summary["relit"])
     first = opened.scene.relight.views[0].name
     shown = [c for c in found if c.view == first and c.light in LIGHTS]

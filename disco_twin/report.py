@@ -96,10 +96,9 @@ def render(data: ReportData) -> str:
 def _header(data: ReportData) -> str:
     summary = data.summary
     capture = summary["capture"]
-    own = [r for r in summary["relit"] if r["method"] == data.main]
-    broad = [float(r["nrmse"]) for r in own if r["light"] in BROAD]
+    broad = [r for r in summary["relit"] if r["light"] in BROAD]
     cards = [
-        (f"{rms(broad):.3f}" if broad else "-", "nrmse under broad light"),
+        (figure_or_dash(pooled(broad, data.main)), "nrmse under broad light"),
         (f"{capture['images']:,}", f"images of {capture['spots']} spots in {capture['views']} views"),
         (_bytes(capture["bytes_stored"]), f"stored, from {_bytes(capture['bytes_raw'])} raw"),
         (_duration(sum(s["seconds"] for s in summary["stages"])), "from scene to scores"),
@@ -146,18 +145,18 @@ def _errors(data: ReportData) -> str:
     methods = list(dict.fromkeys(str(r["method"]) for r in relit))
     if not methods:
         return ""
-    errors = {m: rms(_nrmse(relit, m)) for m in methods}
+    errors = {m: pooled(relit, m) for m in methods}
     points = {m: (data.seconds[m], e) for m, e in errors.items() if m in data.seconds and e > 0}
     pareto = _image(figures.pareto_figure(points), "error against time") if points else ""
     rows = []
     for light in dict.fromkeys(str(r["light"]) for r in relit):
-        values = {m: rms(_nrmse(relit, m, light)) for m in methods}
-        best = min(values.values())
-        cells = "".join(f"<td{' class=best' if v == best else ''}>{v:.3f}</td>" for v in values.values())
+        values = [pooled(relit, m, light) for m in methods]
+        best = min((v for v in values if np.isfinite(v)), default=None)
+        cells = "".join(f"<td{' class=best' if v == best else ''}>{figure_or_dash(v)}</td>" for v in values)
         own = [r for r in relit if r["light"] == light and r["method"] == data.main]
-        energy = " / ".join(f"{r['energy_ratio']:.3f}" for r in own)
-        floor = rms([r["nrmse_floor"] for r in own]) if own else float("nan")
-        rows.append(f"<tr><td>{html.escape(light)}</td>{cells}<td>{energy}</td><td>{floor:.3f}</td></tr>")
+        energy = " / ".join(figure_or_dash(r["energy_ratio"]) for r in own)
+        floor = rms([r["nrmse_floor"] for r in own if r["nrmse_floor"] is not None])
+        rows.append(f"<tr><td>{html.escape(light)}</td>{cells}<td>{energy}</td><td>{figure_or_dash(floor)}</td></tr>")
     heads = "".join(f"<th>{html.escape(m)}</th>" for m in methods)
     table = (
         f"<table><tr><th>light</th>{heads}<th>energy ratio, {html.escape(data.main)}</th><th>noise removed</th></tr>"
@@ -243,8 +242,15 @@ def rms(values: Sequence[float]) -> float:
     return float(np.copysign(abs(square) ** 0.5, square))
 
 
-def _nrmse(relit: Sequence[Mapping[str, Any]], method: str, light: str | None = None) -> list[float]:
-    return [float(r["nrmse"]) for r in relit if r["method"] == method and light in (None, r["light"])]
+def pooled(relit: Sequence[Mapping[str, Any]], method: str, light: str | None = None) -> float:
+    """rms of a method's nrmse over the views, and over the lights unless one is given; NaN where there is no score."""
+    rows = [r for r in relit if r["method"] == method and light in (None, r["light"])]
+    return rms([float(r["nrmse"]) for r in rows if r["nrmse"] is not None])
+
+
+def figure_or_dash(value: float | None) -> str:
+    """Three digits, or a dash where there is no score."""
+    return "-" if value is None or not np.isfinite(value) else f"{value:.3f}"
 
 
 def _cell(value: Any) -> str:

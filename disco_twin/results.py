@@ -16,6 +16,7 @@ from disco_twin.report import ReportData
 from disco_twin.score import load_model, load_relit, load_scores
 from disco_twin.simulate import reference_path
 from disco_twin.world import World, mm_per_pixel
+from pipeline.rig import RigConfig
 
 F64 = NDArray[np.float64]
 
@@ -31,6 +32,7 @@ def collect(world: World, folder: RunFolder, summary: dict[str, Any]) -> ReportD
     truth = Truth.load(folder.twin / "truth.npz")
     points = np.asarray(world.scan.vertices, np.float64)
     distance = np.linalg.norm(points[truth.columns][:, None] - points[None], axis=2)
+    shown, damaged = impulses(world.scene.rig, folder.capture)
     models = {}
     for method in methods:
         if (model := load_model(folder, method)) is not None:
@@ -41,19 +43,19 @@ def collect(world: World, folder: RunFolder, summary: dict[str, Any]) -> ReportD
         summary=summary,
         wavelengths_nm=[laser.wavelength_nm for laser in scene.rig.lasers],
         main=summary["method"],
-        impulses=impulses(world, folder.capture),
+        impulses=shown,
         comparisons=comparisons(world, folder, methods, summary["relit"]),
         distance=distance,
         truth=truth.mean,
         models=models,
-        decades=load_scores(folder)["reflectance"],
+        decades={m: scores for m, scores in load_scores(folder)["reflectance"].items() if scores is not None},
         seconds={name: float(entry["seconds"]) for name, entry in made["methods"].items()},
         balance={
             term: list(getattr(truth.balance, term) / launched)
             for term in ("escaped", "absorbed", "reflected", "boundary", "inside")
         },
         imbalance=float(np.abs(truth.balance.residual).max()),
-        notes=[*notes(world), *made["warnings"]],
+        notes=[*notes(world), *damaged, *made["warnings"]],
     )
 
 
@@ -67,29 +69,39 @@ def notes(world: World) -> list[str]:
     ]
 
 
-def impulses(world: World, capture: Path) -> list[list[Impulse]]:
-    """Rows: cameras, columns: spots spread over the turntable angles; at the laser of the longest wavelength."""
+def impulses(rig: RigConfig, capture: Path) -> tuple[list[list[Impulse]], list[str]]:
+    """Rows: cameras, columns: spots spread over the turntable angles; at the laser of the longest wavelength.
+
+    A spot with a damaged image is left out; the second list says which image that was.
+    """
     from disco_twin.camera.lars3 import lars3_sensor
     from pipeline.calibrate.calibration import nominal_calibration
     from pipeline.capture.plan import ImageAddress
-    from pipeline.capture.stream import StreamReader
+    from pipeline.capture.stream import CorruptImage, StreamReader
 
-    rig = world.scene.rig
     calibration = nominal_calibration(rig, lars3_sensor(rig))
     laser = int(np.argmax([x.wavelength_nm for x in rig.lasers]))
-    rows: list[list[Impulse]] = [[] for _ in rig.cameras]
+    columns: list[list[Impulse]] = []
+    damaged: list[str] = []
     with StreamReader(capture) as stream:
         plan = stream.plan
         for spot in np.unique(np.linspace(0, len(plan.spots) - 1, SPOTS_SHOWN).astype(int)):
-            angle = plan.spots[spot].angle
+            angle, column = plan.spots[spot].angle, []
             for camera, config in enumerate(rig.cameras):
                 view = camera * len(plan.angles_rad) + angle
                 address = ImageAddress(view, "spot", int(spot), laser)
-                image = calibration.radiance(stream.read(address), view, laser)
-                power = stream.meta(address).photodiode_w or calibration.lasers[laser].power_w
+                try:
+                    raw, meta = stream.read(address), stream.meta(address)
+                except CorruptImage as corrupt:
+                    damaged.append(f"The spot {spot} is not shown: {corrupt}.")
+                    break
+                image = calibration.radiance(raw, view, laser)
+                power = meta.photodiode_w or calibration.lasers[laser].power_w
                 radiance = (image.radiance / power).astype(np.float32)
-                rows[camera].append(Impulse(config.name, int(spot), radiance, mm_per_pixel(config)))
-    return rows
+                column.append(Impulse(config.name, int(spot), radiance, mm_per_pixel(config)))
+            else:
+                columns.append(column)
+    return [list(row) for row in zip(*columns, strict=True)], damaged
 
 
 def comparisons(
@@ -112,7 +124,7 @@ def comparisons(
                     {m: load_relit(folder, m, light.name, view.name) for m in methods},
                     world.object_mask(view),
                     mm_per_pixel(view),
-                    {r["method"]: r["nrmse"] for r in rows},
+                    {r["method"]: r["nrmse"] for r in rows if r["nrmse"] is not None},
                 )
             )
     return out

@@ -99,7 +99,8 @@ def capture_stages(run: Run) -> None:
     from disco_twin import simulate
 
     key = run.folder.identity
-    run.stage("scan", key, lambda _: simulate.write_scan(run.world, run.folder.capture))
+    scan_key = content_key(key, run.scene.relight.model_dump_json(include={"views"}), source_key("disco_twin.object"))
+    run.stage("scan", scan_key, lambda _: simulate.write_scan(run.world, run.folder.capture))
     run.stage("capture", key, lambda report: simulate.take_images(run.world, run.folder, report), "images")
 
 
@@ -185,7 +186,7 @@ def print_scores(summary: dict[str, Any], methods: Sequence[str], console: Conso
     """A table of nrmse by light and method."""
     from rich.table import Table
 
-    from disco_twin.report import rms
+    from disco_twin.report import figure_or_dash, pooled
 
     relit = summary["relit"]
     table = Table(box=None, pad_edge=False, header_style="dim")
@@ -193,9 +194,6 @@ def print_scores(summary: dict[str, Any], methods: Sequence[str], console: Conso
     for method in methods:
         table.add_column(method, justify="right")
     for light in dict.fromkeys(r["light"] for r in relit):
-        cells = [
-            rms([r["nrmse"] for r in relit if r["light"] == light and r["method"] == method]) for method in methods
-        ]
-        table.add_row(light, *(f"{c:.3f}" for c in cells))
+        table.add_row(light, *(figure_or_dash(pooled(relit, method, light)) for method in methods))
     console.print()
     console.print(table)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -19,7 +21,10 @@ from hw.errors import InputError
 if TYPE_CHECKING:
     from pipeline.reconstruct.model import ReflectanceModel
 
+log = logging.getLogger(__name__)
+
 FORMAT_VERSION = 1
+KEPT = ("nrmse", "nrmse_se", "nrmse_floor", "psnr", "energy_ratio")
 F32 = NDArray[np.float32]
 
 
@@ -47,9 +52,8 @@ def load_scores(folder: RunFolder) -> dict[str, Any]:
 
 
 def score_relit_images(world: World, folder: RunFolder, methods: Sequence[str]) -> list[dict[str, Any]]:
-    """Rows {light, view, method, nrmse, nrmse_se, nrmse_floor, psnr, energy_ratio}."""
+    """Rows {light, view, method, nrmse, nrmse_se, nrmse_floor, psnr, energy_ratio}; what has no score holds None."""
     from disco_twin.light.references import LAYERS, load_reference
-    from pipeline.relight.scores import score_relit
 
     rows = []
     masks = {view.name: world.object_mask(view) for view in world.scene.relight.views}
@@ -59,11 +63,23 @@ def score_relit_images(world: World, folder: RunFolder, methods: Sequence[str]) 
             a, b = load_reference(reference_path(folder.twin / "references", light, view)).halves[:, layer]
             for method in methods:
                 image = load_relit(folder, method, light.name, view.name)
-                score = asdict(score_relit(image, a, b, masks[view.name]))
-                kept = ("nrmse", "nrmse_se", "nrmse_floor", "psnr", "energy_ratio")
                 row = {"light": light.name, "view": view.name, "method": method}
-                rows.append(row | {k: score[k] for k in kept})
+                rows.append(row | usable_score(" ".join(row.values()), image, a, b, masks[view.name]))
     return rows
+
+
+def usable_score(what: str, image: F32, a: F32, b: F32, mask: NDArray[np.bool_]) -> dict[str, float | None]:
+    """The kept figures of `score_relit`; all None, with a warning, where they cannot be had or are not finite."""
+    from pipeline.relight.scores import Unscorable, score_relit
+
+    try:
+        score = asdict(score_relit(image, a, b, mask))
+        if not all(math.isfinite(score[k]) for k in KEPT if score[k] is not None):
+            raise Unscorable("the relit image holds numbers that are not finite")
+    except Unscorable as why:
+        log.warning("no score for %s: %s", what, why)
+        return dict.fromkeys(KEPT)
+    return {k: score[k] for k in KEPT}
 
 
 def load_relit(folder: RunFolder, method: str, light: str, view: str) -> F32:
@@ -82,9 +98,12 @@ def load_model(folder: RunFolder, method: str) -> ReflectanceModel | None:
 
 
 def score_models(folder: RunFolder, methods: Sequence[str]) -> dict[str, Any]:
-    """By method: log10_rmse of measured and of all entries and the coverage, each by decade below the peak."""
+    """By method: log10_rmse of measured and of all entries and the coverage, each by decade below the peak.
+
+    A method whose R_d cannot be scored has None.
+    """
     from disco_twin.light.truth import Truth
-    from pipeline.relight.scores import score_reflectance
+    from pipeline.relight.scores import Unscorable, score_reflectance
 
     truth = Truth.load(folder.twin / "truth.npz")
     out: dict[str, Any] = {}
@@ -93,8 +112,13 @@ def score_models(folder: RunFolder, methods: Sequence[str]) -> dict[str, Any]:
         if model is None:
             continue
         estimate, measured = model.reflectance[:, truth.columns], model.measured[truth.columns]
-        own = score_reflectance(estimate, truth.mean, truth.standard_error, measured)
-        full = score_reflectance(estimate, truth.mean, truth.standard_error, True)
+        try:
+            own = score_reflectance(estimate, truth.mean, truth.standard_error, measured)
+            full = score_reflectance(estimate, truth.mean, truth.standard_error, True)
+        except Unscorable as why:
+            log.warning("no score for the R_d of %s: %s", method, why)
+            out[method] = None
+            continue
         out[method] = {
             "measured": {str(s.decade): s.log10_rmse for s in own},
             "completed": {str(s.decade): s.log10_rmse for s in full},

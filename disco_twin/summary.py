@@ -38,7 +38,7 @@ def make_summary(
     left_out: Sequence[dict[str, str]],
 ) -> dict[str, Any]:
     """The summary; `scores` as `disco_twin.score.score_run` wrote them."""
-    own = scores["reflectance"].get(method, {"measured": {}, "coverage": {}})
+    own = scores["reflectance"].get(method, {"measured": {}, "coverage": {}}) or {"measured": None, "coverage": None}
     return {
         "format_version": FORMAT_VERSION,
         "scene": scene.name,

@@ -17,6 +17,10 @@ F64 = NDArray[np.float64]
 BLOCK = 8  # pixels: noise is taken as uncorrelated between blocks of this size, and between nothing smaller
 
 
+class Unscorable(ValueError):
+    """The truth leaves nothing to compare with."""
+
+
 @dataclass(frozen=True)
 class RelitScore:
     """Of one relit image against one reference, pooled over object pixels and wavelengths.
@@ -67,11 +71,11 @@ def score_relit(image: ArrayLike, half_a: ArrayLike, half_b: ArrayLike, mask: ND
     """
     i, a, b = (np.asarray(x, np.float64)[:, mask] for x in (image, half_a, half_b))
     if i.size == 0:
-        raise ValueError("the mask holds no pixel")
+        raise Unscorable("the mask holds no pixel")
     mean, half = (a + b) / 2, (a - b) / 2
     denominator = float((a * b).sum())
     if denominator <= 0:
-        raise ValueError("the reference holds no light above its noise")
+        raise Unscorable("the reference holds no light above its noise")
     nrmse2 = float(((i - a) * (i - b)).sum()) / denominator
     noise = _block_sums((i - mean + nrmse2 * mean) * 2 * half, mask)
     nrmse2_se = float(np.sqrt((noise**2).sum())) / denominator
@@ -125,7 +129,7 @@ def score_reflectance(
     seen = np.broadcast_to(np.asarray(covered, bool), t.shape)
     usable = (t > 0) & (se < 0.5 * t)
     if not usable.any():
-        raise ValueError("no entry of the truth is known to better than a half")
+        raise Unscorable("no entry of the truth is known to better than a half")
     peak = np.where(usable, t, 0.0).max(axis=tuple(range(1, t.ndim)), keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         below = np.where(usable, np.log10(peak / t), np.inf)
