@@ -17,6 +17,7 @@ from disco_twin.pipeline_process import pipeline_inputs, reconstruct_apart
 from disco_twin.scene import Profile, Scene, load_scene
 from disco_twin.world import World, identity, left_out_by_the_twin
 from hw.errors import InputError
+from pipeline.capture.files import IMAGES, JOURNAL, PLAN
 from pipeline.capture.loop import Interrupted
 from pipeline.reconstruct.settings import Method
 
@@ -24,6 +25,7 @@ log = logging.getLogger(__name__)
 
 METHODS: tuple[str, ...] = get_args(Method)
 BASELINES = ("dipole", "lambertian")
+LIGHT_CODE = tuple(f"disco_twin.{part}" for part in ("object", "light", "camera", "rig", "deviation", "faults"))
 SCENE_RECORD = "scene.json"  # the scene as it was run: profile applied, file names absolute
 
 
@@ -94,12 +96,36 @@ def choose_methods(text: str | None, scene: Scene) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*chosen, *BASELINES]))
 
 
+def light_key(run: Run) -> str:
+    """Key of all simulated light: what the scene says, and the code that makes object, light and images of it."""
+    return content_key(run.folder.identity, *(source_key(name) for name in LIGHT_CODE))
+
+
+def drop_old_light(folder: RunFolder, key: str) -> None:
+    """Remove light that other code simulated: a stream or a reference would otherwise be continued with the new.
+
+    Nothing is removed from a folder whose light is of this key, or that has none yet.
+    """
+    marker = folder.twin / "light.key"
+    if marker.is_file() and marker.read_text() == key:
+        return
+    old = [folder.capture / name for name in (IMAGES, JOURNAL, PLAN)]
+    old += [*folder.twin.glob("responses/spots-*.npy"), *folder.twin.glob("references/*.exr")]
+    old = [path for path in old if path.is_file()]
+    if old:
+        log.warning("the simulation's code has changed: the light in %s is simulated again", folder.root)
+    for path in old:
+        path.unlink()
+    write_atomically(marker, key.encode())
+
+
 def capture_stages(run: Run) -> None:
     """Scan and capture."""
     from disco_twin import simulate
 
-    key = run.folder.identity
-    scan_key = content_key(key, run.scene.relight.model_dump_json(include={"views"}), source_key("disco_twin.object"))
+    key = light_key(run)
+    drop_old_light(run.folder, key)
+    scan_key = content_key(key, run.scene.relight.model_dump_json(include={"views"}))
     run.stage("scan", scan_key, lambda _: simulate.write_scan(run.world, run.folder.capture))
     run.stage("capture", key, lambda report: simulate.take_images(run.world, run.folder, report), "images")
 
@@ -109,10 +135,11 @@ def truth_stages(run: Run) -> None:
     from disco_twin import simulate
     from disco_twin.world import reference_key
 
-    scene, folder = run.scene, run.folder
+    scene, folder, key = run.scene, run.folder, light_key(run)
+    drop_old_light(folder, key)
     run.stage(
         "truth",
-        folder.identity,
+        key,
         lambda report: simulate.compute_truth(run.world, folder.twin / "truth.npz", report),
         "columns",
     )
@@ -120,7 +147,7 @@ def truth_stages(run: Run) -> None:
     shipped = simulate.shipped_references(run.scene_file, scene.name)
     run.stage(
         "references",
-        content_key(keys, scene.simulation.reference_walks),
+        content_key(key, keys, scene.simulation.reference_walks),
         lambda report: simulate.render_references(run.world, shipped, folder.twin / "references", report),
         "lights",
     )
@@ -128,7 +155,8 @@ def truth_stages(run: Run) -> None:
 
 def pipeline_stage(run: Run) -> None:
     """Reconstruct and relight, in a process of its own that is given the capture and nothing of the truth."""
-    key = content_key(run.folder.identity, pipeline_inputs(run.scene, run.methods), source_key("pipeline"))
+    code = light_key(run), source_key("pipeline"), source_key("hw")
+    key = content_key(run.folder.identity, pipeline_inputs(run.scene, run.methods), *code)
     run.stage("pipeline", key, lambda _: reconstruct_apart(run.scene, run.folder, run.methods))
 
 
@@ -145,6 +173,7 @@ def score_stages(run: Run) -> dict[str, Any]:
             raise InputError(f"the stage {name} is not finished", file=run.folder.root, remedy="disco-twin run")
     key = content_key(
         *(stages[name].key for name in ("truth", "references", "pipeline")),
+        list(run.methods),
         source_key("disco_twin.score"),
         source_key("pipeline.relight.scores"),
     )

@@ -15,11 +15,12 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from disco_twin.deviation import ActualRig
 from disco_twin.light.sources import BeamSource, Source
 from disco_twin.light.transport import Transport
+from disco_twin.object.build import TwinObject
 from hw.interface import Aim
 from pipeline.calibrate.camera import PinholeCamera
 from pipeline.rig import RigConfig
@@ -30,6 +31,22 @@ F32 = NDArray[np.float32]
 
 CHUNK = 20  # spots simulated together and kept in one file
 FLOODLIGHT = 2e-5  # W/(mm^2 sr) that a white surface shows face on
+
+
+def light_key(obj: TwinObject, config: RigConfig, actual: ActualRig) -> str:
+    """Key of what a spot's images depend on beside aim, walks and seed: object, cameras, turntable, beam."""
+    medium, boundary = obj.medium, obj.boundary
+    projector = actual.projector
+    parts: list[ArrayLike] = [obj.mesh.vertices, obj.mesh.faces, medium.sigma_t, medium.albedo, medium.g]
+    parts += [medium.low, medium.high, *actual.turns, projector.pose, projector.full_angle_rad]
+    parts += [projector.steps, projector.separation_mm, actual.mirror_steps, actual.seed]
+    for camera in actual.cameras:
+        parts += [(camera.width, camera.height), camera.focal, camera.centre, camera.distortion, camera.pose]
+    digest = hashlib.sha256(repr((boundary, config.projector.beam_diameter_mm, config.projector.beam_profile)).encode())
+    for part in map(np.ascontiguousarray, parts):
+        digest.update(repr((part.dtype.str, part.shape)).encode())
+        digest.update(part.tobytes())
+    return digest.hexdigest()
 
 
 class SpotResponses:
@@ -47,6 +64,7 @@ class SpotResponses:
         self.views = [
             [actual.camera(c, j) for c in range(len(config.cameras))] for j in range(len(config.turntable_angles_deg))
         ]
+        self._key = light_key(transport.object, config, actual)
         self._chunk_of: dict[Aim, tuple[Aim, ...]] = {}
         self._loaded: tuple[tuple[Aim, ...], F32] | None = None
         scratch.mkdir(parents=True, exist_ok=True)
@@ -76,7 +94,7 @@ class SpotResponses:
         return np.asarray(self._loaded[1][:, chunk.index(aim)])
 
     def _load(self, chunk: tuple[Aim, ...]) -> F32:
-        name = hashlib.sha256(repr((chunk, self.walks, self.seed)).encode()).hexdigest()[:16]
+        name = hashlib.sha256(repr((self._key, chunk, self.walks, self.seed)).encode()).hexdigest()[:16]
         path = self.scratch / f"spots-{name}.npy"
         if not path.exists():
             partial = path.with_suffix(".part")
@@ -95,9 +113,7 @@ class SpotResponses:
             return BeamSource(origins, directions, beam.beam_diameter_mm / 2, power, beam.beam_profile)
 
         cameras = self.views[chunk[0].angle]
-        traced = self.transport.trace(
-            source, len(chunk), self.walks, seed=self.seed, streams=names, cameras=cameras
-        )
+        traced = self.transport.trace(source, len(chunk), self.walks, seed=self.seed, streams=names, cameras=cameras)
         assert traced.images is not None and traced.variance is not None
         return np.stack([traced.images[:, 0], traced.variance[:, 0]])
 
