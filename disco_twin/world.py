@@ -103,8 +103,8 @@ def identity(scene: Scene) -> str:
 
 
 def reference_key(scene: Scene, light: Light, view: CameraConfig) -> str:
-    """Key of a reference image: object, light and view. More walks make it better, not another one."""
-    lasers = len(scene.rig.lasers)
+    """Key of a reference image: object, wavelengths, light and view. More walks make it better, not another one."""
+    lasers = [laser.wavelength_nm for laser in scene.rig.lasers]
     return content_key(_plain(scene.object.model_dump()), lasers, _plain(light.model_dump()), _plain(view.model_dump()))
 
 

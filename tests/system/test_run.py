@@ -101,7 +101,7 @@ def test_every_light_view_and_method_is_scored(summary: dict[str, Any]) -> None:
     assert {(r["light"], r["view"], r["method"]) for r in rows} == {
         (light, view, method)
         for light in ("uniform", "directional")
-        for view in ("left", "low")
+        for view in ("left", "right")
         for method in ("default", "disco2004", "dipole", "lambertian")
     }
     for row in rows:
