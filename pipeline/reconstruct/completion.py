@@ -35,7 +35,6 @@ ROUNDS = 2  # of Gauss-Newton, for each of as many fits of the profile
 TOLERANCE = 1e-2  # of conjugate gradients; every solve starts from the one before
 MOST_STEPS = 300
 MOST_HARMONICS = 500
-LIT = 0.03  # share of a beam's power on a hat function that makes its vertex lit
 
 
 def deviation(distance: F64) -> F64:
@@ -152,12 +151,11 @@ def unexplained(samples: Samples, basis: Harmonics, range_mm: float) -> F64:
 
 
 def measured_entries(samples: Samples) -> NDArray[np.bool_]:
-    """(V, V) entries that a sample is part of: a beam that lights the one vertex's hat, and the other one observed."""
-    used = samples.spots.transmitted > 0
-    lit = (samples.lit[used].toarray() > LIT).astype(np.float32)
-    seen = np.isfinite(samples.values[:, used]).all(axis=0).astype(np.float32)
-    out = lit.T @ seen > 0
-    return np.asarray(out | out.T)
+    """(V, V) entries next to a sample: a spot lies in a triangle at one vertex and the other vertex was observed."""
+    out = np.zeros((len(samples.mesh.vertices),) * 2, bool)
+    for spot in np.flatnonzero(samples.spots.transmitted > 0):
+        out[samples.mesh.faces[samples.spots.triangle[spot]]] |= np.isfinite(samples.values[:, spot]).all(axis=0)
+    return out | out.T
 
 
 def complete(samples: Samples) -> ReflectanceModel:
