@@ -19,7 +19,7 @@ from disco_twin.world import reference_key
 from pipeline.calibrate.camera import PinholeCamera
 from tests.validation.significance import assert_z
 
-REPLICATES, WALKS, BLOCK = 16, 30_000, 12
+REPLICATES, WALKS, BLOCK = 16, 200_000, 31  # large blocks: the noise of small ones is far from normal
 LIGHT = "edge"
 
 
@@ -64,7 +64,7 @@ def test_a_shipped_reference_is_rendered_again(repository: Path) -> None:
         again = block_means(np.concatenate([h[view].halves for h in halves]).astype(float))  # (N, layer, laser, block)
         there = block_means(reference.halves.astype(float).mean(axis=0))
         lit = (again > 0).all(axis=0)
-        assert lit[0].sum() > 30
+        assert lit[0].sum() >= 24
         share = 1 / REPLICATES + WALKS / (2 * reference.walks)
         # Student's t with 15 degrees of freedom has heavier tails than the normal distribution: this level keeps 1e-3.
         assert_z(z_scores(again[:, lit], there[lit], share), f"view {view}, blocks", level=1e-5)
