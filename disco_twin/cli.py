@@ -123,9 +123,7 @@ def main(arguments: list[str] | None = None) -> Any:
         return _stop(str(error), 2)
     except OSError as error:
         known = refused_by_the_disk(error, Path.cwd())
-        if known is None:
-            raise
-        return _stop(str(known), 2)
+        return _stop(str(known or f"{error.filename or 'input or output'}: {error.strerror or error}"), 2)
 
 
 def _stop(message: str, status: int) -> None:

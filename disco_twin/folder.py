@@ -10,8 +10,9 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,18 +20,28 @@ from typing import Any
 from hw.errors import DiscoError, InputError
 from pipeline.resources import measured
 
+log = logging.getLogger(__name__)
+
 FORMAT_VERSION = 1
 
 
 @dataclass
 class StageRecord:
-    """A stage's inputs as a key, and what it took. Seconds add up over interruptions; the peak is the largest."""
+    """A stage's inputs as a key, and what it took. Seconds add up over interruptions; the peak is the largest.
+
+    outputs: size in bytes of each file that the finished stage left, by its path in the run folder.
+    """
 
     name: str
     key: str
     seconds: float = 0.0
     peak_mb: float = 0.0
     finished: bool = False
+    outputs: dict[str, int] = field(default_factory=dict)
+
+    def intact(self, root: Path) -> bool:
+        """Whether the files are still there, of the same size."""
+        return all((root / p).is_file() and (root / p).stat().st_size == size for p, size in self.outputs.items())
 
 
 @dataclass
@@ -101,14 +112,18 @@ class RunFolder:
         folder._save()
         return folder
 
-    def run(self, name: str, key: str, work: Callable[[], float | None]) -> bool:
+    def run(self, name: str, key: str, work: Callable[[], float | None], outputs: Sequence[str] = ()) -> bool:
         """Do a stage unless it is finished under the same key; True if it was done now.
 
+        outputs: patterns of the files that it leaves; where one is missing or cut later, the stage is done again.
         `work` may return the peak memory in MiB of a process of its own, which then counts as the stage's.
         """
         record = self.stages.get(name)
         if record is not None and record.key == key and record.finished:
-            return False
+            if record.intact(self.root):
+                return False
+            log.warning("%s: a file is missing or cut, the stage is done again", name)
+            record = None
         if record is None or record.key != key:
             record = StageRecord(name, key)
         self.stages[name] = record
@@ -118,6 +133,8 @@ class RunFolder:
             with measured() as usage:
                 child = work()
             record.finished = True
+            files = [path for pattern in outputs for path in self.root.glob(pattern) if path.is_file()]
+            record.outputs = {str(path.relative_to(self.root)): path.stat().st_size for path in files}
         finally:
             if usage is not None:
                 record.seconds += usage.seconds

@@ -25,6 +25,14 @@ log = logging.getLogger(__name__)
 
 METHODS: tuple[str, ...] = get_args(Method)
 BASELINES = ("dipole", "lambertian")
+OUTPUTS = {  # files that a finished stage leaves, as patterns in the run folder
+    "scan": ("capture/scan.ply", "capture/rig.json", "capture/sensor.json"),
+    "capture": ("capture/images.bin", "capture/journal.bin", "capture/plan.json"),
+    "truth": ("twin/truth.npz",),
+    "references": ("twin/references/*.exr",),
+    "pipeline": ("work/pipeline.json", "work/model-*.npz", "work/relit/*/*.npy"),
+    "scores": ("twin/scores.json",),
+}
 LIGHT_CODE = tuple(f"disco_twin.{part}" for part in ("object", "light", "camera", "rig", "deviation", "faults"))
 SCENE_RECORD = "scene.json"  # the scene as it was run: profile applied, file names absolute
 
@@ -52,7 +60,7 @@ class Run:
             return peak if isinstance(peak, float) else None
 
         try:
-            done = self.folder.run(name, key, watched)
+            done = self.folder.run(name, key, watched, OUTPUTS.get(name, ()))
         except KeyboardInterrupt:
             raise Interrupted(f"stopped during {name}; the same command continues") from None
         except OSError as error:

@@ -130,7 +130,11 @@ def render_references(world: World, shipped: Path, own: Path, progress: Progress
     def usable(path: Path, key: str) -> bool:
         if not path.is_file():
             return False
-        found = load_reference(path)
+        try:
+            found = load_reference(path)
+        except InputError as error:
+            log.warning("%s", error)
+            return False
         return found.key == key and found.walks >= walks // 2
 
     for done, light in enumerate(lights):

@@ -90,7 +90,7 @@ def load_reference(path: Path) -> Reference:
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             header, channels = dict(file.header()), {name: c.pixels for name, c in file.channels().items()}
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         remedy = "delete it, it is rendered again"
         raise InputError(f"not a readable EXR ({error})", file=path, remedy=remedy) from error
     if header.get("formatVersion") != FORMAT_VERSION:

@@ -7,6 +7,7 @@ function of vertex v: cosine in, cosine out, which is what is reciprocal.
 from __future__ import annotations
 
 import os
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,8 +58,12 @@ class Truth:
 
     @classmethod
     def load(cls, path: Path) -> Truth:
-        """Read what `save` wrote; another format version is refused."""
-        with np.load(path, allow_pickle=False) as data:
+        """Read what `save` wrote; a damaged file or another format version is refused."""
+        try:
+            data = np.load(path, allow_pickle=False)
+        except (zipfile.BadZipFile, ValueError, EOFError) as error:
+            raise InputError("is damaged", file=path, remedy="disco-twin run computes it again") from error
+        with data:
             if int(data["format_version"]) != FORMAT_VERSION:
                 raise InputError(
                     "unknown format", file=path, key="format_version", value=int(data["format_version"]),

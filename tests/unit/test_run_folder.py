@@ -93,3 +93,19 @@ def test_the_peak_is_the_blocks_own() -> None:
     assert large.peak_mb - small.peak_mb > 150
     assert large.seconds > small.seconds >= 0
     assert usable_cores() >= 1
+
+
+@pytest.mark.parametrize("damage", ["deleted", "cut"])
+def test_a_stage_whose_file_is_missing_or_cut_is_done_again(tmp_path: Path, damage: str) -> None:
+    folder = RunFolder(tmp_path)
+    made = tmp_path / "twin" / "truth.npz"
+    made.parent.mkdir()
+    work = lambda: made.write_bytes(b"0123456789") and None  # noqa: E731
+    assert folder.run("truth", "k", work, ["twin/*.npz"])
+    assert not folder.run("truth", "k", work, ["twin/*.npz"])
+    if damage == "deleted":
+        made.unlink()
+    else:
+        made.write_bytes(b"01234")
+    assert folder.run("truth", "k", work, ["twin/*.npz"])
+    assert made.read_bytes() == b"0123456789"
