@@ -5,8 +5,8 @@ from __future__ import annotations
 from disco_twin.world import World, left_out_by_the_twin
 from pipeline.resources import usable_cores
 
-# Measured on quick.toml (alpha .3, mean free path about 1.7 mm), per core and second; other media scale with the
-# number of collisions, so this is a guess within a factor of two or three.
+# Measured on an earlier quick.toml (alpha .3, mean free path about 1.7 mm, twice today's), per core and second; other
+# media scale with the number of collisions, so this is a guess within a factor of two or three.
 SPOT_WALKS, TRUTH_WALKS, REFERENCE_WALKS = 100_000.0, 200_000.0, 60_000.0
 COMPRESSION = 7.0  # docs/decisions/0002
 IMAGES_PER_S = 15.0  # of the real rig (thesis 4.1)

@@ -14,6 +14,7 @@ F64 = NDArray[np.float64]
 class EnergyBalance:
     """Mean fractions of the launched power per wavelength (L,), and their sum's departure from one.
 
+    `reflected` never entered, and counts photons that missed the object too.
     launched + roulette = reflected + escaped + absorbed + boundary + inside, up to rounding.
     """
 

@@ -100,10 +100,10 @@ class Transport:
             faces=mi.UInt32(self.faces.astype(np.uint32).ravel()),
             vertices=to_float(self.vertices),
             vertex_count=len(self.vertices),
-            # Some 40 units in the last place of the largest coordinate: far below a free path, above rounding.
             kappa=dr.opaque(mi.Float, self.lobe.kappa),
             reach=dr.opaque(mi.Float, self.lobe.reach),
             length=dr.opaque(mi.Float, self.lobe.length),
+            # Some 40 units in the last place of the largest coordinate: far below a free path, above rounding.
             lift=dr.opaque(mi.Float, 4e-6 * (1.0 + float(np.abs(self.vertices).max()))),
         )
 

@@ -5,8 +5,8 @@ all samples, s the size of what it leaves unexplained, and G a smooth symmetric 
 G solves one symmetric positive definite system: the samples at the spots' barycentric points bind columns and, by
 reciprocity, rows; smoothness over the surface on both sides fills the rest. Values are compared with their expectation
 linearly and weighted by precision (`Measured.residual`), so that a noisy tail neither dominates nor turns negative.
-What was measured is not overwritten: at a spot the model differs from the sample by no more than the sample's own
-noise and the scatter of R_d below the mesh's resolution (`profile.scatter`).
+Samples bind the fit, they are not copied into it: at a spot the model differs from the sample by the sample's noise and
+an assumed scatter of R_d below the mesh's resolution (`profile.scatter`); see docs/decisions/0013.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ F32 = NDArray[np.float32]
 
 log = logging.getLogger(__name__)
 
-RANGE_MM_PER_EDGE = 1.3  # correlation length of G in edges; fitted on the quick scene against its truth
+RANGE_EDGES = 1.3  # correlation length of G in edges; fitted on the quick scene against its truth
 NEAR, FAR, TURN_MM = 0.08, 0.6, 6.0  # s(distance): relative deviation of R_d from the profile
 ROUNDS = 2  # of Gauss-Newton, for each of as many fits of the profile
 TOLERANCE = 1e-2  # of conjugate gradients; every solve starts from the one before
@@ -160,7 +160,7 @@ def measured_entries(samples: Samples) -> NDArray[np.bool_]:
 
 def complete(samples: Samples) -> ReflectanceModel:
     """The default method: samples -> model."""
-    range_mm = RANGE_MM_PER_EDGE * float(samples.mesh.edges_unique_length.mean())
+    range_mm = RANGE_EDGES * float(samples.mesh.edges_unique_length.mean())
     basis = harmonics(samples.mesh, MOST_HARMONICS)
     field = SymmetricField.of(basis, samples.lit, range_mm)
     y, found, at_spots = np.zeros_like(field.penalty), [], []

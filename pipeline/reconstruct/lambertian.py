@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.calibrate.fresnel import Boundary
-from pipeline.reconstruct.completion import MOST_HARMONICS, RANGE_MM_PER_EDGE, measured_entries, measured_of
+from pipeline.reconstruct.completion import MOST_HARMONICS, RANGE_EDGES, measured_entries, measured_of
 from pipeline.reconstruct.harmonics import harmonics
 from pipeline.reconstruct.mesh import interpolation, vertex_areas
 from pipeline.reconstruct.model import ReflectanceModel
@@ -36,7 +36,7 @@ def fit_lambertian(samples: Samples) -> ReflectanceModel:
     """The baseline: samples -> model with R_d = albedo / area on the diagonal."""
     area = vertex_areas(samples.mesh)
     edge = float(samples.mesh.edges_unique_length.mean())
-    covariance = harmonics(samples.mesh, MOST_HARMONICS).covariance(RANGE_MM_PER_EDGE * edge)
+    covariance = harmonics(samples.mesh, MOST_HARMONICS).covariance(RANGE_EDGES * edge)
     to_spots = interpolation(samples.mesh, samples.spots.triangle, samples.spots.barycentric)
     reflectance = np.zeros((len(samples.values), len(area), len(area)), np.float32)
     for laser in range(len(samples.values)):

@@ -88,7 +88,7 @@ def test_variance_covers_the_error(small) -> None:  # type: ignore[no-untyped-de
     assert (np.abs(z) > 4).mean() < 0.01
 
 
-def test_measured_entries_are_not_overwritten(small, field) -> None:  # type: ignore[no-untyped-def]
+def test_the_fit_passes_the_samples_within_noise_and_scatter(small, field) -> None:  # type: ignore[no-untyped-def]
     """Rationale: at a spot the model may differ from a sample by the sample's noise and the scatter below the mesh's
     resolution; the standardised difference is one at most in the mean, and no single one is far out.
     """
