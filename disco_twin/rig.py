@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from disco_twin.camera.lars3 import Lars3
 from disco_twin.deviation import ActualRig, actual_rig
 from disco_twin.faults import LaserPower, Stream, generator, speckle
-from hw.errors import DiscoError, InputError
+from hw.errors import DiscoError, InputError, Refused
 from hw.interface import Aim, Camera, Floodlight, Laser, Photodiode, Projector, Turntable
 from hw.record import RawImage
 from pipeline.rig import RigConfig
@@ -40,10 +40,6 @@ class ResponseSource(Protocol):
 
     def silhouette(self, camera: int, angle: int) -> F32:
         """(height, width) radiance in W/(mm^2 sr) under the floodlight, at the first laser's wavelength."""
-
-
-class Refused(DiscoError):
-    """The rig was asked for something unsafe or impossible, and did not do it."""
 
 
 @dataclass(frozen=True)

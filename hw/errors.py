@@ -28,3 +28,40 @@ class InputError(DiscoError):
         what = "" if key is None else (f"{key}: " if value is None else f"{key} = {value!r}: ")
         tail = ("" if allowed is None else f" (allowed: {allowed})") + ("" if remedy is None else f". Remedy: {remedy}")
         super().__init__(f"{where}{what}{problem}{tail}")
+
+
+class Refused(DiscoError):
+    """The rig was asked for something unsafe or impossible, and did not do it."""
+
+
+class DeviceError(DiscoError):
+    """Something is wrong with a device: names its port, the device as the rig knows it, the problem and the remedy."""
+
+    def __init__(self, port: str, device: str, problem: str, remedy: str) -> None:
+        self.port, self.device, self.problem, self.remedy = port, device, problem, remedy
+        self.without_remedy = f"{port}: {device} {problem}"
+        super().__init__(f"{self.without_remedy}. Remedy: {remedy}")
+
+
+class NoAnswer(DeviceError):
+    """The device said nothing in time. What it was asked to do may have happened nevertheless."""
+
+
+class Garbled(DeviceError):
+    """The device's answer makes no sense. What it was asked to do may have happened nevertheless."""
+
+
+class Unplugged(DeviceError):
+    """The port cannot be opened, read or written."""
+
+
+class WrongDevice(DeviceError):
+    """Another device than the expected one is at this port."""
+
+
+class DeviceRefused(DeviceError):
+    """The device understood and did not do it."""
+
+
+class DeviceFault(DeviceError):
+    """The device reports a fault of its own: interlock, stall, over-temperature, a lost reference."""

@@ -13,8 +13,8 @@ from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.camera.lens import vignetting
 from disco_twin.deviation import actual_rig
 from disco_twin.faults import MODE_HOP_S, SPECKLE_CONTRAST, LaserPower, Stream, generator, speckle
-from disco_twin.rig import TURN_S, Refused, TwinRig
-from hw.errors import DiscoError, InputError
+from disco_twin.rig import TURN_S, TwinRig
+from hw.errors import DiscoError, InputError, Refused
 from hw.interface import Aim, Rig
 from hw.record import RawImage, to_radiance
 from pipeline.calibrate.camera import PinholeCamera, turn

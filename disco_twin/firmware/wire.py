@@ -1,0 +1,172 @@
+"""The line between a computer and an emulated device: baud rate, latency, and everything that goes wrong on a cable.
+
+A device's firmware is a pure state machine: bytes in, timed bytes out. `Line` lets its answers arrive when a real line
+would deliver them, and implements `hw.ports.protocol_memory.Peer`, so that drivers reach it as `memory://NAME`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import Protocol
+
+from hw.clock import Clock
+
+Timed = tuple[float, bytes]  # seconds from now, bytes of one message
+Fault = Callable[[bytes], list[Timed]]  # what becomes of an answer
+
+BITS_PER_BYTE = 10  # start, eight bits, stop
+
+
+class Firmware(Protocol):
+    """A device: parser and state."""
+
+    baud: int
+
+    def opened(self, now: float) -> None:
+        """The port was opened: some boards reset."""
+
+    def feed(self, data: bytes, now: float) -> list[Timed]:
+        """Bytes from the computer; what the device answers, in order, and when."""
+
+    def power_cycle(self, now: float) -> None:
+        """The mains failed and came back."""
+
+
+# ---- what may become of an answer
+
+
+def lost(data: bytes) -> list[Timed]:
+    """It never arrives; what it answers has happened."""
+    return []
+
+
+def late(seconds: float) -> Fault:
+    """It arrives later: likely as the answer to the next command."""
+    return lambda data: [(seconds, data)]
+
+
+def split(at: int, pause_s: float = 0.05) -> Fault:
+    """It arrives in two pieces."""
+    return lambda data: [(0.0, data[:at]), (pause_s, data[at:])]
+
+
+def garbled(at: int, mask: int = 0x15) -> Fault:
+    """Some bits of one byte are wrong."""
+
+    def fault(data: bytes) -> list[Timed]:
+        i = at % len(data)
+        return [(0.0, data[:i] + bytes([data[i] ^ mask]) + data[i + 1 :])]
+
+    return fault
+
+
+def after(noise: bytes) -> Fault:
+    """Other bytes arrive in the same read, before it: NULs, garbage, a message, another answer."""
+    return lambda data: [(0.0, noise + data)]
+
+
+def broken_by(message: bytes, at: int) -> Fault:
+    """Another message breaks into it."""
+    return lambda data: [(0.0, data[:at] + message + data[at:])]
+
+
+# ---- the line
+
+
+class Line:
+    """A device on its line. Faults are queued: each befalls one answer, or one write of the computer."""
+
+    def __init__(self, firmware: Firmware, clock: Clock) -> None:
+        self.firmware, self.clock = firmware, clock
+        self.answer_faults: deque[Fault | None] = deque()
+        self.command_faults: deque[Callable[[bytes], bytes] | None] = deque()
+        self.plugged = True
+        self._open = False
+        self._free = -math.inf  # when the line has delivered everything
+        self._arriving: deque[Timed] = deque()  # absolute times
+        self._arrived = bytearray()
+
+    # ---- what a test or a user does to it
+
+    def unplug(self) -> None:
+        """Pull the cable: the port is dead until it is plugged in and opened again."""
+        self.plugged = self._open = False
+        self._forget()
+
+    def plug(self) -> None:
+        """Put the cable back."""
+        self.plugged = True
+
+    def power_cycle(self) -> None:
+        """Switch the device off and on; the port (its USB adapter) survives."""
+        self._forget()
+        self.firmware.power_cycle(self.clock.now())
+
+    def say(self, data: bytes) -> None:
+        """The device says something unasked."""
+        self._send([(0.0, data)])
+
+    def _forget(self) -> None:
+        self._arriving.clear()
+        self._arrived.clear()
+        self._free = -math.inf
+
+    # ---- the computer's side
+
+    def opened(self) -> None:
+        """The port was opened."""
+        if not self.plugged:
+            raise OSError(2, "no such port: the device is unplugged")
+        self._open = True
+        self._forget()
+        self.firmware.opened(self.clock.now())
+
+    def closed(self) -> None:
+        """The port was closed; the device goes on."""
+        self._open = False
+
+    def _require_cable(self) -> None:
+        if not self._open:
+            raise OSError(5, "input/output error: the device is unplugged")
+
+    def receive(self, data: bytes) -> None:
+        """Bytes from the computer."""
+        self._require_cable()
+        fault = self.command_faults.popleft() if self.command_faults else None
+        if fault is not None:
+            data = fault(data)
+        self._send(self.firmware.feed(data, self.clock.now() + self._duration(data)))
+
+    def _send(self, answers: list[Timed]) -> None:
+        now = self.clock.now()
+        for delay, data in answers:
+            fault = self.answer_faults.popleft() if self.answer_faults else None
+            for more, piece in [(0.0, data)] if fault is None else fault(data):
+                self._free = max(self._free, now + delay + more) + self._duration(piece)
+                self._arriving.append((self._free, piece))
+
+    def _duration(self, data: bytes) -> float:
+        return len(data) * BITS_PER_BYTE / self.firmware.baud
+
+    def next_arrival(self) -> float:
+        """When the next bytes arrive; infinity if none are on their way."""
+        return self._arriving[0][0] if self._arriving else math.inf
+
+    def waiting(self) -> int:
+        """Bytes that have arrived."""
+        self._require_cable()
+        while self._arriving and self._arriving[0][0] <= self.clock.now():
+            self._arrived += self._arriving.popleft()[1]
+        return len(self._arrived)
+
+    def deliver(self, size: int, timeout_s: float) -> bytes:
+        """At most `size` bytes; lets the clock go on to the first of them, or to the timeout."""
+        if not self.waiting():
+            now = self.clock.now()
+            self.clock.sleep(min(timeout_s, max(0.0, self.next_arrival() - now)))
+            self.waiting()
+        data = bytes(self._arrived[:size])
+        del self._arrived[:size]
+        return data

@@ -1,0 +1,190 @@
+"""Thorlabs Elliptec rotation stages (ELL14): 9600 baud, one hex digit of address and two letters a command.
+
+The answer to a move comes when the motion has ended; `GS` with a code comes instead of it when something is wrong.
+Answers have no number of ours and no checksum, so that after a lost one the line must fall silent first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+
+from hw.devices.turning import POLL_S, degrees_of, not_reached
+from hw.errors import DeviceFault, Garbled, NoAnswer, WrongDevice
+from hw.serial_link import Inbox, Link, persist
+
+T = TypeVar("T")
+
+BAUD = 9600
+ANSWER_S = 0.5
+HOME_S = 20.0
+QUIET_S = 0.3
+ROTARY = {0x0E: "ELL14", 0x12: "ELL18"}
+OK, BUSY = 0, 9
+CODES = {
+    1: "a communication time-out",
+    2: "a mechanical time-out",
+    3: "an unknown command",
+    4: "a value out of range",
+    5: "its module isolated",
+    6: "its module out of isolation",
+    7: "an initialisation error",
+    8: "a thermal error",
+    9: "busy",
+    10: "a sensor error",
+    11: "a motor error",
+    12: "a position out of range",
+    13: "an over-current",
+}
+
+
+class ElliptecFramer:
+    """Lines without CR and LF; NULs are dropped."""
+
+    def __init__(self) -> None:
+        self._line = bytearray()
+
+    def reset(self) -> None:
+        """Forget an unfinished line."""
+        self._line.clear()
+
+    def feed(self, data: bytes) -> list[str]:
+        """The lines that end in these bytes."""
+        lines = []
+        for byte in data:
+            if byte in b"\r\n":
+                if self._line:
+                    lines.append(self._line.decode("latin-1"))
+                self._line.clear()
+            elif byte:
+                self._line.append(byte)
+        return lines
+
+
+class ElliptecTable:
+    """A rotary stage on a bus of up to 16; `address` is 0 unless it was changed."""
+
+    def __init__(self, link: Link, address: int = 0, reach_s: float = 20.0) -> None:
+        self.link, self.reach_s = link, reach_s
+        self._address = f"{address:X}"
+        self._inbox: Inbox[str] = Inbox(link, ElliptecFramer())
+        self.model, self.serial_number, self._pulses = self._identify()
+
+    # ---- talking
+
+    def _once(self, command: str, expected: str, timeout_s: float) -> str:
+        """The data of the next `expected` answer or of a `GS`, which begins with its letters."""
+        a = self._address
+        self._inbox.clear()
+        self.link.write((a + command).encode("ascii"))
+        wanted = {a + expected, a + "GS"}
+        line = self._inbox.next(lambda m: m[:3] in wanted, timeout_s)
+        if line is None:
+            problem = f"did not answer {a + command!r} within {timeout_s:g} s"
+            raise NoAnswer(self.link.url, self.link.device, problem, "check cable and power of the turntable")
+        return line[1:]
+
+    def _ask(self, command: str, expected: str, parse: Callable[[str], T], timeout_s: float = ANSWER_S) -> T:
+        def attempt() -> T:
+            answer = self._once(command, expected, timeout_s)
+            try:
+                return parse(answer)
+            except ValueError as error:
+                problem = f"answered {self._address + command!r} with {answer[:40]!r}"
+                raise Garbled(self.link.url, self.link.device, problem, "check cable and grounding") from error
+
+        return persist(attempt, self._resynchronise)
+
+    def _resynchronise(self) -> None:
+        """Wait until nothing more comes."""
+        self._inbox.drain(QUIET_S)
+
+    # ---- identity
+
+    def _identify(self) -> tuple[str, str, int]:
+        try:
+            answer = self._ask("in", "IN", str)
+        except NoAnswer as error:
+            raise self._wrong(f"is not an Elliptec stage: it {error.problem}") from error
+        try:
+            kind, serial, travel, pulses = int(answer[2:4], 16), answer[4:12], int(answer[20:24], 16), answer[24:32]
+            steps = int(pulses, 16)
+        except ValueError as error:
+            raise self._wrong(f"is not an Elliptec stage: it answered {answer[:40]!r}") from error
+        if kind not in ROTARY or travel != 360:
+            raise self._wrong(f"is not a rotation stage: an ELL{kind} with a travel of {travel} answered")
+        return ROTARY[kind], serial, steps
+
+    def _wrong(self, problem: str) -> WrongDevice:
+        remedy = "check the ports in the rig file; `disco-twin rig probe` says which device is where"
+        return WrongDevice(self.link.url, self.link.device, problem, remedy)
+
+    # ---- moving
+
+    def home(self) -> None:
+        """Find the zero (clockwise)."""
+        self._go("ho0", 0.0, 0, HOME_S)
+
+    def move(self, angle_rad: float) -> None:
+        """Turn to an angle; returns when the table stands still there."""
+        angle = degrees_of(angle_rad)
+        target = round(angle / 360.0 * self._pulses)
+        self._go(f"ma{target:08X}", angle, target, self.reach_s)
+
+    def _go(self, command: str, angle_deg: float, target: int, limit_s: float) -> None:
+        """Start, wait for the end of the motion, compare the place; a lost answer does not start it again."""
+        clock = self.link.clock
+        end = clock.now() + limit_s
+        try:
+            self._check(self._once(command, "PO", limit_s))
+        except NoAnswer:
+            while (code := self._ask("gs", "GS", _code)) == BUSY:
+                if clock.now() > end:
+                    where = f"it stands at {np.rad2deg(self.angle_rad()):.1f} deg"
+                    raise not_reached(self.link, angle_deg, limit_s, where) from None
+                clock.sleep(POLL_S)
+            self._check(f"GS{code:02X}")
+        tolerance = max(2, round(self._pulses / 3600))  # 0.1 deg: what the stage repeats to
+        found = self._position()
+        away = (found - target + self._pulses // 2) % self._pulses - self._pulses // 2
+        if abs(away) > tolerance:
+            problem = f"stopped at {found / self._pulses * 360.0:.2f} deg instead of {angle_deg:.2f} deg"
+            remedy = "check that nothing blocks the table, then home it again"
+            raise DeviceFault(self.link.url, self.link.device, problem, remedy)
+
+    def _check(self, answer: str) -> None:
+        if answer.startswith("GS") and answer != "GS00":
+            code = _code(answer)
+            problem = f"reports {CODES.get(code, f'error {code}')}"
+            remedy = "check that nothing blocks the table, then home it again"
+            raise DeviceFault(self.link.url, self.link.device, problem, remedy)
+
+    def _position(self) -> int:
+        """Pulses from zero, signed."""
+
+        def pulses(answer: str) -> int:
+            if not answer.startswith("PO") or len(answer) != 10:
+                raise ValueError(answer)
+            value = int(answer[2:], 16)
+            return value - (1 << 32) if value >> 31 else value
+
+        return self._ask("gp", "PO", pulses)
+
+    def angle_rad(self) -> float:
+        """Where it stands, 0 .. 2 pi."""
+        return float(2.0 * np.pi * (self._position() / self._pulses % 1.0))
+
+    def stop(self) -> None:
+        """An Elliptec stage cannot be stopped; its moves take a second or two."""
+
+    def close(self) -> None:
+        """Give the port back."""
+        self.link.close()
+
+
+def _code(answer: str) -> int:
+    if not answer.startswith("GS") or len(answer) != 4:
+        raise ValueError(answer)
+    return int(answer[2:], 16)

@@ -1,0 +1,173 @@
+"""Mirrors, laser gates and photodiode on one port: the Micro-Manager Arduino firmware ("MM-Ard", version 5).
+
+Bytes, not text, at 57600 baud; facts from its source (mmCoreAndDevices, AOTFcontroller.ino). It has no frame, so the
+driver keeps in step by counting: what is not the expected echo is answered by a pause longer than the firmware waits
+for an argument (1 s), and a new beginning. Setting a value twice does no harm.
+"""
+
+from __future__ import annotations
+
+from hw.errors import DeviceRefused, Garbled, InputError, NoAnswer, WrongDevice
+from hw.serial_link import Inbox, Link, persist
+
+BAUD = 57_600
+BOOT_S = 2.0  # opening the port resets the board
+ANSWER_S = 0.2
+FORGET_S = 1.1  # the firmware drops a command whose argument does not come within 1 s
+STEPS = 4096  # of the 12-bit DAC
+ADC_TOP = 1023
+LINES = 6
+PINS = 6
+IDENTITY = b"MM-Ard\r\n"
+
+SET_LINES, GET_LINES, SET_DAC, NO_BLANKING, IDENTIFY, VERSION, CHANNELS, READ_PIN = 1, 2, 3, 21, 30, 31, 34, 41
+
+
+class ByteFramer:
+    """No frames at all: every byte is a message."""
+
+    def feed(self, data: bytes) -> list[int]:
+        """The bytes."""
+        return list(data)
+
+    def reset(self) -> None:
+        """Nothing is kept."""
+
+
+class MirrorBoard:
+    """The board. Connecting shuts every line."""
+
+    def __init__(self, link: Link) -> None:
+        """Wait for the board to start, identify it, shut everything."""
+        self.link = link
+        self._inbox: Inbox[int] = Inbox(link, ByteFramer())
+        link.clock.sleep(BOOT_S)
+        self.version = self._identify()
+        self.shut()
+        self._exchange(bytes([NO_BLANKING]), bytes([NO_BLANKING]))
+
+    # ---- talking
+
+    def _exchange(self, command: bytes, echo: bytes, answer: int = 0) -> bytes:
+        """Send, expect the echo and `answer` more bytes; tried again, since every command may be given twice."""
+
+        def attempt() -> bytes:
+            self._inbox.clear()
+            self.link.write(command)
+            got = self._receive(len(echo) + answer, command)
+            if got[: len(echo)] != echo:
+                problem = f"answered {command.hex(' ')} with {got.hex(' ')} instead of {echo.hex(' ')}"
+                raise Garbled(self.link.url, self.link.device, problem, "check cable and grounding of the board")
+            return got[len(echo) :]
+
+        return persist(attempt, self._resynchronise)
+
+    def _receive(self, size: int, command: bytes) -> bytes:
+        end = self.link.clock.now() + ANSWER_S
+        got = bytearray()
+        while len(got) < size:
+            byte = self._inbox.next(lambda _: True, end - self.link.clock.now())
+            if byte is None:
+                problem = f"did not answer {command.hex(' ')} within {ANSWER_S:g} s"
+                raise NoAnswer(self.link.url, self.link.device, problem, "check cable and power of the board")
+            got.append(byte)
+        return bytes(got)
+
+    def _resynchronise(self) -> None:
+        """Whatever it was waiting for or about to say: after this the board listens for a command, and is silent."""
+        self._inbox.drain(FORGET_S)
+
+    # ---- identity
+
+    def _identify(self) -> int:
+        self._inbox.clear()
+        try:
+            self._exchange(bytes([IDENTIFY]), IDENTITY)
+        except (NoAnswer, Garbled) as error:
+            raise self._wrong(f"is not an MM-Ard board: {error.problem}") from error
+        version = self._line(VERSION)
+        channels = self._exchange(bytes([CHANNELS]), bytes([CHANNELS]), 1)[0] if version >= 5 else 0
+        if channels < 2:
+            problem = f"(MM-Ard version {version}) was built for {channels} DAC channels and would ignore the mirrors"
+            remedy = "build AOTFcontroller.ino, version 5 or newer, with TLV5618 defined"
+            raise WrongDevice(self.link.url, self.link.device, problem, remedy)
+        return version
+
+    def _line(self, command: int) -> int:
+        """A number in text, ended by CR LF."""
+
+        def attempt() -> int:
+            self._inbox.clear()
+            self.link.write(bytes([command]))
+            text = self._receive(3, bytes([command]))
+            while not text.endswith(b"\r\n"):
+                text += self._receive(1, bytes([command]))
+            try:
+                return int(text)
+            except ValueError as error:
+                problem = f"answered {command} with {text!r}, which is no number"
+                remedy = "check cable and grounding of the board"
+                raise Garbled(self.link.url, self.link.device, problem, remedy) from error
+
+        return persist(attempt, self._resynchronise)
+
+    def _wrong(self, problem: str) -> WrongDevice:
+        remedy = "check the ports in the rig file; `disco-twin rig probe` says which device is where"
+        return WrongDevice(self.link.url, self.link.device, problem, remedy)
+
+    # ---- what it does
+
+    def set_mirrors(self, u: int, v: int) -> None:
+        """DAC values 0 .. 4095 of both axes, one after the other: the beam draws an L, so the gates must be shut."""
+        for channel, (name, value) in enumerate((("u", u), ("v", v))):
+            if not 0 <= value < STEPS:
+                raise InputError("no such mirror step", key=name, value=value, allowed=f"0 to {STEPS - 1}")
+            command = bytes([SET_DAC, channel, value >> 8, value & 0xFF])
+            self._exchange(command, command)
+
+    def set_lines(self, pattern: int) -> None:
+        """The TTL lines as bits 0 .. 5; read back, since the echo does not contain them."""
+        if not 0 <= pattern < 1 << LINES:
+            raise InputError("no such pattern of TTL lines", value=pattern, allowed=f"0 to {(1 << LINES) - 1}")
+        if not pattern:
+            self.shut()
+            return
+        self._exchange(bytes([SET_LINES, pattern]), bytes([SET_LINES]))
+        self._require(pattern)
+
+    def shut(self) -> None:
+        """Every line low, wherever in a command the board's parser is.
+
+        The longest command takes three arguments: three zeros end any unfinished one (with a harmless value) and are
+        ignored otherwise, so that `1 0` is understood in any case.
+        """
+        self._exchange(bytes([0, 0, 0, SET_LINES, 0]), bytes([SET_LINES]))
+        self._require(0)
+
+    def lines(self) -> int:
+        """The TTL lines as they are."""
+        return self._exchange(bytes([GET_LINES]), bytes([GET_LINES]), 1)[0] & (1 << LINES) - 1
+
+    def counts(self, pin: int) -> int:
+        """The 10-bit ADC's value at an analogue pin."""
+        if not 0 <= pin < PINS:
+            raise InputError("no such analogue pin", value=pin, allowed=f"0 to {PINS - 1}")
+        high, low = self._exchange(bytes([READ_PIN, pin]), bytes([READ_PIN, pin]), 2)
+        if high > ADC_TOP >> 8:
+            problem = f"read {high << 8 | low} at pin {pin} of a 10-bit converter"
+            raise Garbled(self.link.url, self.link.device, problem, "check cable and grounding of the board")
+        return high << 8 | low
+
+    def _require(self, pattern: int) -> None:
+        found = self.lines()
+        if found != pattern:
+            problem = f"has its TTL lines at {found:06b} instead of {pattern:06b}"
+            remedy = "switch the board off and on; blanking and trigger modes must be off"
+            raise DeviceRefused(self.link.url, self.link.device, problem, remedy)
+
+    def close(self) -> None:
+        """Shut every line as far as the board still listens, and give the port back."""
+        try:
+            self.shut()
+        finally:
+            self.link.close()

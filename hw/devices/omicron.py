@@ -1,0 +1,392 @@
+"""Omicron lasers (PhoxX, LuxX, LuxX+): the ASCII protocol over USB (500000 baud) or RS-232 (57600).
+
+`?` + three letters + arguments + CR is answered by `!` + the same letters + data + CR; a setting by `>` (done) or `x`
+(refused), an unknown command by `!UK`. Messages that begin with `$` come whenever the laser likes, NUL bytes too.
+Facts: Micro-Manager's Omicron adapter and Odemis's omicronxx driver. There is no host watchdog: a laser that was told
+to emit does so until it is told otherwise.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import NoReturn, TypeVar
+
+from hw.errors import DeviceError, DeviceFault, DeviceRefused, Garbled, NoAnswer, WrongDevice
+from hw.serial_link import Inbox, Link, persist
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+USB_BAUD, RS232_BAUD = 500_000, 57_600
+MODELS = {3: "PhoxX", 4: "LuxX", 18: "LuxX+"}
+ANSWER_S = 0.5
+EMISSION_S = 8.0  # LOn takes about 3 s
+RESET_S = 12.0  # RsC takes about 5 s
+POLL_S = 0.1
+LEVELS = 0xFFF
+WAVELENGTH_TOLERANCE_NM = 10.0
+SEPARATOR = re.compile("[|\xa7]")  # 0xA7, or `|` after ?GFw|
+PROBES = ("GFw", "GSN", "GMP")  # harmless questions, to see where in the stream of answers we are
+
+
+class Status(IntFlag):
+    """GAS."""
+
+    ERROR = 1 << 0
+    ON = 1 << 1
+    PREHEAT = 1 << 2
+    ATTENTION = 1 << 4
+    ENABLE_PIN = 1 << 6
+    KEY = 1 << 7
+    TOGGLE_KEY = 1 << 8
+    POWERED = 1 << 9
+
+
+class Mode(IntFlag):
+    """GOM and SOM."""
+
+    BIAS = 1 << 3
+    RELEASE = 1 << 4
+    DIGITAL = 1 << 5
+    ANALOG = 1 << 7
+    APC = 1 << 8
+    ADHOC = 1 << 13
+    AUTOSTART = 1 << 14
+    AUTO_POWERUP = 1 << 15
+
+
+FAULTS = {  # GFB and GLF
+    0: "the soft interlock is set (only a reset clears it)",
+    4: "the CDRH box is missing or not allowed",
+    5: "no communication with the head",
+    6: "relay K1 failed",
+    8: "the supply voltage is out of range",
+    9: "the interlock is open",
+    10: "the diode's current is too high",
+    11: "the ambient temperature is out of range",
+    12: "the diode's temperature is out of range",
+    14: "an internal error occurred",
+    15: "the diode's power is too high",
+}
+SAFE_OFF = Mode.BIAS | Mode.RELEASE | Mode.AUTOSTART  # cleared whenever the laser is not to emit
+SOFTWARE_ONLY = Mode.DIGITAL | Mode.ANALOG | Mode.ADHOC  # cleared, so that nothing but these commands drives the laser
+
+
+class OmicronFramer:
+    """Answers (`!...`) without their CR; `$...` messages, NULs and whatever precedes the `!` are dropped.
+
+    A `$` message may break into the middle of an answer. Dropped messages are kept in `notices` until they are taken.
+    """
+
+    def __init__(self) -> None:
+        self._notice: bytearray | None = None  # a `$` message that has begun
+        self._line = bytearray()
+        self.notices: list[str] = []
+
+    def reset(self) -> None:
+        """Forget an unfinished message."""
+        self._notice = None
+        self._line.clear()
+
+    def feed(self, data: bytes) -> list[str]:
+        """The answers that end in these bytes."""
+        answers = []
+        for byte in data:
+            if byte == 0:
+                continue
+            if self._notice is not None:
+                if byte == 0x0D:
+                    self.notices.append(self._notice.decode("latin-1"))
+                    self._notice = None
+                else:
+                    self._notice.append(byte)
+            elif byte == ord("$"):
+                self._notice = bytearray()
+            elif byte == 0x0D:
+                start = self._line.rfind(b"!")
+                if start >= 0:
+                    answers.append(self._line[start:].decode("latin-1"))
+                self._line.clear()
+            else:
+                self._line.append(byte)
+        return answers
+
+
+@dataclass(frozen=True)
+class LaserIdentity:
+    """What a laser says of itself."""
+
+    model: str
+    firmware: str
+    serial_number: str
+    wavelength_nm: float
+    max_power_mw: float
+
+
+class OmicronLaser:
+    """One laser. Connecting switches it off; `arm` and `emit` are needed before light leaves it."""
+
+    def __init__(self, link: Link, wavelength_nm: float) -> None:
+        """Identify and switch off. `wavelength_nm`: the laser that the rig expects at this port."""
+        self.link, self.framer = link, OmicronFramer()
+        self._inbox: Inbox[str] = Inbox(link, self.framer)
+        self._owed: set[str] = set()  # questions whose answer may still come
+        self._temporary_power = True  # TPP is known, as far as we know
+        self.identity = self._identify(wavelength_nm)
+        self.armed_mw = 0.0
+        self.force_off()
+
+    @property
+    def name(self) -> str:
+        """What the rig calls this laser."""
+        return self.link.device
+
+    # ---- talking
+
+    def ask(self, letters: str, arguments: str = "") -> str:
+        """The data of the answer. For what may be asked twice: reading, and setting to a value."""
+        return self._ask(letters, arguments, str)
+
+    def _ask(self, letters: str, arguments: str, parse: Callable[[str], T]) -> T:
+        """Ask until the answer can be parsed (ValueError: it cannot)."""
+
+        def attempt() -> T:
+            answer = self._once(letters, arguments)
+            try:
+                return parse(answer)
+            except ValueError as error:
+                problem = f"answered ?{letters}{arguments} with {answer[:40]!r}, which makes no sense"
+                remedy = "check cable, baud rate and grounding of the laser"
+                raise Garbled(self.link.url, self.name, problem, remedy) from error
+
+        return persist(attempt, self._resynchronise)
+
+    def _once(self, letters: str, arguments: str = "") -> str:
+        """Ask once. Only an answer with the same letters counts."""
+        if self._owed:
+            self._resynchronise()
+        self._inbox.clear()
+        self.link.write(f"?{letters}{arguments}\r".encode("latin-1"))
+        self._owed.add(letters)
+        answer = self._inbox.next(_begins("!" + letters, "!UK"), ANSWER_S)
+        if answer is None:
+            problem = f"did not answer ?{letters}{arguments} within {ANSWER_S:g} s"
+            raise NoAnswer(self.link.url, self.name, problem, "check cable and power of the laser")
+        self._owed.discard(letters)
+        if answer.startswith("!UK"):
+            raise DeviceRefused(
+                self.link.url, self.name, f"does not know ?{letters}{arguments}", "a laser of another kind?"
+            )
+        return answer[1 + len(letters) :]
+
+    def _resynchronise(self) -> None:
+        """Answers come in order: once a probe that is owed nothing is answered, no older answer can come any more."""
+        for probe in [p for p in PROBES if p not in self._owed]:
+            self._inbox.clear()
+            self.link.write(f"?{probe}\r".encode("latin-1"))
+            self._owed.add(probe)
+            if self._inbox.next(_begins("!" + probe), ANSWER_S) is not None:
+                self._owed.clear()
+                return
+        self._inbox.drain(quiet_s=1.0)
+        self._owed.clear()
+
+    def _set(self, letters: str, arguments: str = "") -> None:
+        """Set to a value; done twice if the answer is lost."""
+        if self._ask(letters, arguments, _done_or_refused) == "x":
+            self._refuse(f"refused ?{letters}{arguments}")
+
+    def _number(self, letters: str) -> float:
+        return self._ask(letters, "", float)
+
+    def _bits(self, letters: str) -> int:
+        return self._ask(letters, "", lambda answer: int(answer, 16))
+
+    def _refuse(self, what: str) -> NoReturn:
+        """Say why the laser does not do what it was asked for."""
+        faults = self.faults()
+        if faults:
+            raise DeviceFault(self.link.url, self.name, f"{what}: {'; '.join(faults)}", "remove the cause, then reset")
+        raise DeviceRefused(self.link.url, self.name, what, "check key switch, interlock and enable pin")
+
+    # ---- identity
+
+    def _identify(self, wavelength_nm: float) -> LaserIdentity:
+        expected = f"an Omicron laser of {wavelength_nm:g} nm"
+        try:
+            answer = self.ask("GFw")
+        except (NoAnswer, DeviceRefused) as error:
+            raise self._wrong(f"is not {expected}: nothing answered ?GFw") from error
+        fields = SEPARATOR.split(answer)
+        if len(fields) < 3 or not fields[1].isdigit() or int(fields[1]) not in MODELS:
+            raise self._wrong(f"is not {expected}: ?GFw was answered by {answer[:40]!r}")
+        found_nm = self._ask("GSI", "", lambda answer: float(SEPARATOR.split(answer)[0]))
+        if abs(found_nm - wavelength_nm) > WAVELENGTH_TOLERANCE_NM:
+            raise self._wrong(f"is not {expected}: a {MODELS[int(fields[1])]} of {found_nm:g} nm answered")
+        return LaserIdentity(MODELS[int(fields[1])], fields[2], self.ask("GSN"), found_nm, self._number("GMP"))
+
+    def _wrong(self, problem: str) -> WrongDevice:
+        remedy = "check the ports in the rig file; `disco-twin rig probe` says which device is where"
+        return WrongDevice(self.link.url, self.name, problem, remedy)
+
+    # ---- state
+
+    def status(self) -> Status:
+        """What the laser is doing."""
+        return Status(self._bits("GAS"))
+
+    def mode(self) -> Mode:
+        """How the laser is driven."""
+        return Mode(self._bits("GOM"))
+
+    def faults(self) -> list[str]:
+        """The present failures, in words; read twice, since a garbled bit must not stop a scan."""
+        first, second = self._bits("GFB"), self._bits("GFB")
+        return [text for bit, text in FAULTS.items() if first & second & 1 << bit]
+
+    def measured_mw(self) -> float:
+        """Power by the laser's own photodiode, in mW."""
+        return self._number("MDP")
+
+    def level(self) -> float:
+        """The stored set point as a share of the maximum power."""
+        return self._bits("GLP") / LEVELS
+
+    def temperatures_c(self) -> tuple[float | None, float | None]:
+        """Diode and ambient temperature; None where the laser has no sensor."""
+        diode, ambient = (
+            self._ask(letters, "", lambda a: None if a.startswith("x") else float(a)) for letters in ("MTD", "MTA")
+        )
+        return diode, ambient
+
+    def require_ready(self) -> None:
+        """Refuse to go on with an open interlock, a turned key or any failure."""
+        faults = self.faults()
+        if faults:
+            remedy = "remove the cause, then `reset` the laser or switch it off and on"
+            raise DeviceFault(self.link.url, self.name, "cannot emit: " + "; ".join(faults), remedy)
+        status = self.status()
+        for bad, problem, remedy in (
+            (Status.TOGGLE_KEY in status, "waits for its key", "turn the key switch off and on"),
+            (Status.KEY not in status, "is locked by its key", "turn the key switch on"),
+            (Status.ENABLE_PIN not in status, "is locked by its enable pin", "press the laser's shutter button"),
+        ):
+            if bad:
+                raise DeviceFault(self.link.url, self.name, problem, remedy)
+
+    # ---- power and emission
+
+    def force_off(self) -> None:
+        """No light, now and after a power cut: LOf, power 0, no autostart, operating release and bias off."""
+        self.armed_mw = 0.0
+        failed: list[DeviceError] = []
+        steps: tuple[Callable[[], None], ...] = (
+            lambda: self._set("LOf"),
+            lambda: self._set_power(0.0),
+            lambda: self._set("SAS", "0"),
+            lambda: self._set_mode(clear=SAFE_OFF | SOFTWARE_ONLY),
+        )
+        for step in steps:
+            try:
+                step()
+            except DeviceError as error:  # the other steps may still get through
+                failed.append(error)
+        if failed:
+            raise failed[0]
+
+    def arm(self, power_mw: float) -> None:
+        """Allow light of this power; none leaves the laser before `emit`."""
+        top = self.identity.max_power_mw
+        if not 0.0 < power_mw <= top * (1.0 + 1e-9):
+            problem = f"cannot be set to {power_mw:g} mW"
+            raise DeviceRefused(self.link.url, self.name, problem, f"ask for more than 0 and at most {top:g} mW")
+        self.require_ready()
+        self._set("POn")
+        self._set_power(min(1.0, power_mw / top))
+        self._set_mode(add=Mode.BIAS | Mode.RELEASE)
+        self.armed_mw = power_mw
+
+    def emit(self) -> None:
+        """Start emission; returns once the laser says that it is on. Its gate must be shut."""
+        if not self.armed_mw:
+            raise DeviceRefused(self.link.url, self.name, "is not armed", "arm it with a power before it may emit")
+        try:
+            answer = self._once("LOn")
+        except NoAnswer:  # not sent again: the status says whether it was understood
+            log.warning("%s: the answer to LOn was lost; asking for the status instead", self.name)
+            self._resynchronise()
+            answer = ">"
+        if answer.startswith("x"):
+            self._refuse("refused to emit")
+        clock = self.link.clock
+        end = clock.now() + EMISSION_S
+        while Status.ON not in self.status() or not self.measured_mw() > 0.0:
+            if clock.now() > end:
+                self.require_ready()
+                problem = f"did not emit within {EMISSION_S:g} s"
+                raise NoAnswer(self.link.url, self.name, problem, "check key switch, interlock and enable pin")
+            clock.sleep(POLL_S)
+
+    def stop_emission(self) -> None:
+        """Switch the light off; it takes seconds to come back. May be asked for at any time."""
+        self._set("LOf")
+
+    def reset(self) -> None:
+        """Clear latched failures by a restart of the controller (seconds), and switch off."""
+        self._inbox.clear()
+        self.framer.notices.clear()
+        self.link.write(b"?RsC\r")
+        clock = self.link.clock
+        end = clock.now() + RESET_S
+        while not any(notice.startswith("RsC") for notice in self.framer.notices):
+            if clock.now() > end:
+                problem = f"did not come back within {RESET_S:g} s after a reset"
+                raise NoAnswer(self.link.url, self.name, problem, "switch the laser off and on")
+            self._inbox.next(lambda _: False, POLL_S)
+        self._owed.clear()
+        self.force_off()
+
+    def close(self) -> None:
+        """Switch off as far as the laser still listens, and give the port back."""
+        try:
+            self.force_off()
+        finally:
+            self.link.close()
+
+    def _set_power(self, share: float) -> None:
+        """TPP (not stored), or SLP where TPP is unknown: its memory wears out, so it is written on change only."""
+        if self._temporary_power:
+            try:
+                self._set("TPP", f"{100.0 * share:.5f}")
+                return
+            except DeviceRefused as error:
+                if "does not know" not in error.problem:
+                    raise
+                self._temporary_power = False
+        level = round(share * LEVELS)
+        if round(self.level() * LEVELS) != level:
+            self._set("SLP", f"{level:03X}")
+
+    def _set_mode(self, add: int = 0, clear: int = 0) -> None:
+        before = self.mode()
+        wanted = (int(before) | add) & ~clear & 0xFFFF
+        if wanted != before:
+            self._set("SOM", f"{wanted:04X}")
+        if self.mode() != wanted:
+            problem = f"did not keep mode {wanted:04X}"
+            raise DeviceRefused(self.link.url, self.name, problem, "reset the laser, or switch it off and on")
+
+
+def _begins(*prefixes: str) -> Callable[[str], bool]:
+    return lambda message: message.startswith(prefixes)
+
+
+def _done_or_refused(answer: str) -> str:
+    if answer[:1] not in (">", "x"):
+        raise ValueError(answer)
+    return answer[0]

@@ -1,0 +1,91 @@
+"""Ophir power meters (Vega, Nova II) over RS-232, 9600 baud: `$..` CR LF is answered by `*...` or `?...`, CR LF.
+
+Answers have neither number nor checksum: after a lost one the line must fall silent before the next question, and a
+reading must look like a power.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import TypeVar
+
+from hw.devices.elliptec import ElliptecFramer as LineFramer
+from hw.errors import DeviceFault, DeviceRefused, Garbled, NoAnswer, WrongDevice
+from hw.serial_link import Inbox, Link, persist
+
+T = TypeVar("T")
+
+BAUD = 9600
+ANSWER_S = 1.0
+QUIET_S = 0.5
+METERS = ("VEGA", "NOVAII", "NOVA2", "LASERSTAR")
+POWER = re.compile(r"-?\d+(\.\d+)?(E[+-]?\d+)?")
+
+
+class OphirMeter:
+    """A calibrated power meter: the reference that the rig's photodiode is compared with."""
+
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        self._inbox: Inbox[str] = Inbox(link, LineFramer())
+        self.model = self._identify()
+        self.head = self._ask("HI", str)
+
+    def _once(self, command: str) -> str:
+        self._inbox.clear()
+        self.link.write(f"${command}\r\n".encode("ascii"))
+        line = self._inbox.next(lambda m: m[:1] in "*?", ANSWER_S)
+        if line is None:
+            problem = f"did not answer ${command} within {ANSWER_S:g} s"
+            raise NoAnswer(self.link.url, self.link.device, problem, "check cable, power and baud rate of the meter")
+        if line.startswith("?"):
+            problem = f"refused ${command} ({line[1:].strip()})"
+            raise DeviceRefused(self.link.url, self.link.device, problem, "check that a sensor head is plugged in")
+        return line[1:].strip()
+
+    def _ask(self, command: str, parse: Callable[[str], T]) -> T:
+        def attempt() -> T:
+            answer = self._once(command)
+            try:
+                return parse(answer)
+            except ValueError as error:
+                problem = f"answered ${command} with {answer[:40]!r}, which makes no sense"
+                raise Garbled(self.link.url, self.link.device, problem, "check cable and baud rate") from error
+
+        return persist(attempt, lambda: (self._inbox.drain(QUIET_S), None)[1])
+
+    def _identify(self) -> str:
+        try:
+            answer = self._ask("II", str)
+        except (NoAnswer, DeviceRefused) as error:
+            raise self._wrong(f"is not an Ophir meter: it {error.problem}") from error
+        model = answer.split()[0].upper() if answer else ""
+        if model not in METERS:
+            raise self._wrong(f"is not an Ophir meter that is known here: it answered {answer[:40]!r}")
+        return model
+
+    def _wrong(self, problem: str) -> WrongDevice:
+        remedy = "check the ports in the rig file; `disco-twin rig probe` says which device is where"
+        return WrongDevice(self.link.url, self.link.device, problem, remedy)
+
+    def read(self) -> float:
+        """Watts on the sensor."""
+
+        def watts(answer: str) -> float:
+            if answer.upper() == "OVER":
+                return math.inf
+            if not POWER.fullmatch(answer):
+                raise ValueError(answer)
+            return float(answer)
+
+        value = self._ask("SP", watts)
+        if math.isinf(value):
+            problem = "is over its range"
+            raise DeviceFault(self.link.url, self.link.device, problem, "choose a higher range or attenuate the beam")
+        return value
+
+    def close(self) -> None:
+        """Give the port back."""
+        self.link.close()

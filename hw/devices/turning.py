@@ -1,0 +1,43 @@
+"""What the turntables have in common: degrees of a full turn, and the words for not arriving."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from hw.errors import NoAnswer
+from hw.serial_link import Link
+
+POLL_S = 0.1
+
+
+class Table(Protocol):
+    """A turntable's driver: it satisfies `hw.interface.Turntable` and knows how to find its zero."""
+
+    link: Link
+
+    def home(self) -> None:
+        """Find the zero again: after power-on, a power cut or a stall."""
+
+    def move(self, angle_rad: float) -> None:
+        """Turn to an angle; returns when the table stands still there."""
+
+    def angle_rad(self) -> float:
+        """Where it stands, 0 .. 2 pi."""
+
+    def stop(self) -> None:
+        """Stop at once."""
+
+    def close(self) -> None: ...
+
+
+def degrees_of(angle_rad: float) -> float:
+    """The angle within one turn, in degrees."""
+    return float(np.rad2deg(angle_rad)) % 360.0
+
+
+def not_reached(link: Link, angle_deg: float, limit_s: float, where: str) -> NoAnswer:
+    """The error of a turntable that did not arrive in time."""
+    problem = f"did not reach {angle_deg:.1f} deg in {limit_s:g} s ({where})"
+    return NoAnswer(link.url, link.device, problem, "check that nothing blocks the table, then home it again")

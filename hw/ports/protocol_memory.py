@@ -1,0 +1,114 @@
+"""pyserial's handler of `memory://NAME`: a port whose other end is an object of this process.
+
+Emulated devices and replayed logs attach themselves here, so that drivers open them as they open any port: by
+`serial.serial_for_url`. Waiting is the peer's business: it knows the clock.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from serial import PortNotOpenError, SerialBase, SerialException
+
+PREFIX = "memory://"
+
+
+class Peer(Protocol):
+    """The device at the other end of a port. Raises OSError where a real port would: when it is unplugged."""
+
+    def opened(self) -> None:
+        """The port was opened: some devices reset."""
+
+    def closed(self) -> None: ...
+
+    def receive(self, data: bytes) -> None:
+        """Bytes from the computer."""
+
+    def deliver(self, size: int, timeout_s: float) -> bytes:
+        """At most `size` bytes to the computer; waits for the first of them for at most `timeout_s`."""
+
+    def waiting(self) -> int:
+        """How many bytes have arrived and not been read."""
+
+
+_PEERS: dict[str, Peer] = {}
+
+
+def attach(name: str, peer: Peer) -> str:
+    """Make a peer reachable; returns its URL. A name that is taken changes its owner (another device is plugged in)."""
+    _PEERS[name.lower()] = peer
+    return PREFIX + name.lower()
+
+
+def detach(name: str) -> None:
+    """Nobody answers at this name any more."""
+    _PEERS.pop(name.lower(), None)
+
+
+class Serial(SerialBase):
+    """The computer's end of a memory port."""
+
+    _peer: Peer | None = None
+
+    def open(self) -> None:
+        """Find the peer and tell it."""
+        peer = _PEERS.get(str(self.port).removeprefix(PREFIX))
+        if peer is None:
+            raise SerialException(f"nothing is attached to {self.port}")
+        try:
+            peer.opened()
+        except OSError as error:
+            raise SerialException(str(error)) from error
+        self._peer, self.is_open = peer, True
+
+    def close(self) -> None:
+        """Tell the peer; a second time does nothing."""
+        peer, self._peer, self.is_open = self._peer, None, False
+        if peer is not None:
+            peer.closed()
+
+    def _open_peer(self) -> Peer:
+        if self._peer is None:
+            raise PortNotOpenError
+        return self._peer
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that can be read without waiting."""
+        return self._open_peer().waiting()
+
+    def read(self, size: int = 1, /) -> bytes:
+        """At most `size` bytes within the port's timeout."""
+        peer = self._open_peer()
+        try:
+            return peer.deliver(size, self.timeout or 0.0)
+        except OSError as error:
+            raise SerialException(str(error)) from error
+
+    def write(self, data: bytes, /) -> int:  # type: ignore[override]
+        """Hand over all bytes."""
+        peer = self._open_peer()
+        try:
+            peer.receive(bytes(data))
+        except OSError as error:
+            raise SerialException(str(error)) from error
+        return len(data)
+
+    def reset_input_buffer(self) -> None:
+        """Forget what has arrived."""
+        peer = self._open_peer()
+        peer.deliver(peer.waiting(), 0.0)
+
+    def reset_output_buffer(self) -> None:
+        """Nothing waits to be sent: the peer takes everything at once."""
+
+    def flush(self) -> None:
+        """Nothing waits to be sent."""
+
+    def _reconfigure_port(self) -> None:
+        """A memory port has no settings."""
+
+
+def serial_class_for_url(url: str) -> tuple[str, type[Serial]]:
+    """What `serial.serial_for_url` asks a handler for."""
+    return url.lower(), Serial

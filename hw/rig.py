@@ -1,0 +1,320 @@
+"""A rig of real devices behind `hw.interface.Rig`: Omicron lasers, an MM-Ard board, a turntable, cameras.
+
+The board moves the mirrors, opens the gates, switches the floodlight and reads the photodiode. Lasers stay powered
+through a scan, since emission takes seconds to start: between images they are dark because their gates are shut.
+Whatever is emulated or simulated comes in by the port's name, the cameras and the timebase.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Protocol, Self
+
+from hw.clock import Clock
+from hw.devices.mm_ard import ADC_TOP
+from hw.devices.turning import Table
+from hw.errors import DeviceFault, DiscoError, Refused
+from hw.interface import Aim, Camera, Floodlight, Laser, Photodiode, Projector, Turntable
+
+log = logging.getLogger(__name__)
+
+SETTLE_S = 0.005  # of the galvos, after the DAC has taken both values
+
+
+class Head(Protocol):
+    """A laser's driver (`hw.devices.omicron.OmicronLaser`, or a guard in front of it)."""
+
+    @property
+    def name(self) -> str: ...
+    def arm(self, power_mw: float) -> None: ...
+    def emit(self) -> None: ...
+    def force_off(self) -> None: ...
+    def close(self) -> None: ...
+
+
+class Board(Protocol):
+    """The driver of mirrors, TTL lines and photodiode (`hw.devices.mm_ard.MirrorBoard`)."""
+
+    def set_mirrors(self, u: int, v: int) -> None: ...
+    def set_lines(self, pattern: int) -> None: ...
+    def shut(self) -> None: ...
+    def counts(self, pin: int) -> int: ...
+    def close(self) -> None: ...
+
+
+class Timebase(Protocol):
+    """The clock that the capture's record is written by."""
+
+    def restart(self) -> None:
+        """The rig is ready: this is time 0."""
+
+    def now(self) -> float: ...
+    def resume_at(self, time_s: float) -> None: ...
+
+
+class Elapsed:
+    """Seconds on a clock since the rig was ready; an interrupted capture goes on from its last image's time."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock, self._start = clock, clock.now()
+
+    def restart(self) -> None:
+        """Time 0 is now."""
+        self._start = self._clock.now()
+
+    def now(self) -> float:
+        """Seconds since then."""
+        return self._clock.now() - self._start
+
+    def resume_at(self, time_s: float) -> None:
+        """Now is `time_s`."""
+        self._start = self._clock.now() - time_s
+
+
+@dataclass(frozen=True)
+class LaserWiring:
+    """One laser: its gate's TTL line, its photodiode's ADC pin, watts on the object per ADC count, and its power.
+
+    `limits`: the photodiode's reading must lie within these shares of the power, or the image is refused.
+    """
+
+    wavelength_nm: float
+    power_mw: float
+    gate_line: int
+    pin: int
+    watts_per_count: float
+    limits: tuple[float, float] = (0.1, 1.5)
+
+
+@dataclass(frozen=True)
+class Devices:
+    """Drivers that are connected, the lasers in the order of the wiring."""
+
+    heads: Sequence[Head]
+    board: Board
+    table: Table
+
+
+class SerialRig:
+    """`hw.interface.Rig` over drivers. Devices are connected on entering, so that entering again reconnects."""
+
+    def __init__(
+        self,
+        connect: Callable[[], Devices],
+        wiring: Sequence[LaserWiring],
+        cameras: Sequence[Camera],
+        clock: Clock,
+        *,
+        flood_line: int | None = None,
+        timebase: Timebase | None = None,
+        announce: Callable[[Sequence[Aim]], None] | None = None,
+        centre: tuple[int, int] = (2048, 2048),
+    ) -> None:
+        """`connect` closes what it has opened if it fails. `centre`: where the mirrors stand at first."""
+        self._connect, self.wiring, self.clock = connect, tuple(wiring), clock
+        self.flood_line, self._announce, self._centre = flood_line, announce, centre
+        self._timebase: Timebase = Elapsed(clock) if timebase is None else timebase
+        self._devices: Devices | None = None
+        self._pattern, self._last_open = 0, -1
+        self.lasers: Sequence[Laser] = [GatedLaser(self, i) for i in range(len(self.wiring))]
+        self.projector: Projector = Mirrors(self)
+        self.turntable: Turntable = Turning(self)
+        self.cameras: Sequence[Camera] = list(cameras)
+        self.photodiode: Photodiode = AdcPhotodiode(self)
+        self.floodlight: Floodlight = TtlFloodlight(self)
+
+    # ---- on and off
+
+    def __enter__(self) -> Self:
+        """Connect, home, then arm the lasers and wait for their emission, behind shut gates."""
+        self._devices = devices = self._connect()
+        try:
+            devices.board.shut()
+            self._pattern = 0
+            devices.board.set_mirrors(*self._centre)
+            self.clock.sleep(SETTLE_S)
+            devices.table.home()
+            for head, wiring in zip(devices.heads, self.wiring, strict=True):
+                head.arm(wiring.power_mw)
+                head.emit()
+        except BaseException:
+            self.make_safe()
+            raise
+        self._timebase.restart()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.make_safe()
+
+    def make_safe(self) -> None:
+        """Gates shut, lasers and floodlight off, ports given back. Never raises; the first device to fail stops no
+        other."""
+        devices, self._devices = self._devices, None
+        self._pattern, self._last_open = 0, -1
+        if devices is None:
+            return
+        steps: list[Callable[[], None]] = [devices.board.shut]
+        steps += [head.force_off for head in devices.heads]
+        steps += [head.close for head in devices.heads]
+        steps += [devices.board.close, devices.table.close]
+        for step in steps:
+            try:
+                step()
+            except DiscoError as error:
+                log.error("making the rig safe: %s", error)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the devices are there."""
+        return self._devices is not None
+
+    def devices(self) -> Devices:
+        """The drivers; refused outside `with rig:`."""
+        if self._devices is None:
+            raise Refused("the rig is switched off: use it inside `with rig:`")
+        return self._devices
+
+    # ---- time
+
+    def now(self) -> float:
+        """Seconds since the rig was ready."""
+        return self._timebase.now()
+
+    def resume_at(self, time_s: float) -> None:
+        """Continue an interrupted capture whose last image was stored at `time_s`."""
+        self._timebase.resume_at(time_s)
+
+    def announce(self, aims: Sequence[Aim]) -> None:
+        """Simulated cameras work ahead; real ones ignore it."""
+        if self._announce is not None:
+            self._announce(aims)
+
+    # ---- TTL lines
+
+    @property
+    def open_gate(self) -> int:
+        """The laser whose gate is open, or -1."""
+        return next((i for i, w in enumerate(self.wiring) if self._pattern >> w.gate_line & 1), -1)
+
+    def switch(self, line: int, on: bool) -> None:
+        """One line, the others as they are. A line that may have been switched counts as on."""
+        board, before = self.devices().board, self._pattern
+        after = before | 1 << line if on else before & ~(1 << line)
+        self._pattern = before | after
+        board.set_lines(after)
+        self._pattern = after
+
+    def require_dark(self, what: str) -> None:
+        """Refuse to move anything while laser light is let out."""
+        self.devices()
+        if self.open_gate >= 0:
+            raise Refused(f"the {what} must not move while the gate of laser {self.open_gate} is open")
+
+    @property
+    def last_open(self) -> int:
+        """The laser whose gate was opened last, or -1."""
+        return self._last_open
+
+    def opened(self, laser: int) -> None:
+        """Remember whose photodiode is to be read."""
+        self._last_open = laser
+
+
+@dataclass
+class GatedLaser:
+    """One laser behind its gate."""
+
+    rig: SerialRig
+    index: int
+
+    @property
+    def wavelength_nm(self) -> float:
+        """Nominal wavelength."""
+        return self.rig.wiring[self.index].wavelength_nm
+
+    def open_gate(self) -> None:
+        """Let light out; refused while another gate is open."""
+        self.rig.devices()
+        if self.rig.open_gate not in (-1, self.index):
+            raise Refused(f"the gate of laser {self.rig.open_gate} is open: one laser at a time")
+        self.rig.opened(self.index)
+        self.rig.switch(self.rig.wiring[self.index].gate_line, True)
+
+    def close_gate(self) -> None:
+        """Shut this gate; always allowed."""
+        if self.rig.open_gate == self.index:
+            self.rig.switch(self.rig.wiring[self.index].gate_line, False)
+
+
+@dataclass
+class Mirrors:
+    """The two mirrors."""
+
+    rig: SerialRig
+
+    def move(self, u: int, v: int) -> None:
+        """Aim at mirror steps (u, v); returns when the mirrors have settled."""
+        self.rig.require_dark("projector")
+        self.rig.devices().board.set_mirrors(u, v)
+        self.rig.clock.sleep(SETTLE_S)
+
+
+@dataclass
+class Turning:
+    """The turntable."""
+
+    rig: SerialRig
+
+    def move(self, angle_rad: float) -> None:
+        """Turn to an angle; returns when the table stands still."""
+        self.rig.require_dark("turntable")
+        self.rig.devices().table.move(angle_rad)
+
+
+@dataclass
+class AdcPhotodiode:
+    """The photodiode of the laser that was opened last, by the board's 10-bit converter."""
+
+    rig: SerialRig
+
+    def read(self) -> float:
+        """Watts on the object; refused when they are not those that the laser was set to."""
+        board, laser = self.rig.devices().board, self.rig.last_open
+        if laser < 0:
+            return 0.0
+        wiring = self.rig.wiring[laser]
+        counts = board.counts(wiring.pin)
+        watts = counts * wiring.watts_per_count
+        low, high = wiring.limits
+        if self.rig.open_gate == laser and (counts >= ADC_TOP or not low <= watts / (wiring.power_mw * 1e-3) <= high):
+            head = self.rig.devices().heads[laser]
+            problem = f"gives {1e3 * watts:.2f} mW at the photodiode instead of {wiring.power_mw:g} mW"
+            if counts >= ADC_TOP:
+                problem += " (the converter is at its top)"
+            remedy = "check the laser's interlock, the gate and the photodiode's gain"
+            raise DeviceFault(f"pin {wiring.pin}", head.name, problem, remedy)
+        return watts
+
+
+@dataclass
+class TtlFloodlight:
+    """The spotlights that fully illuminate the object for a silhouette image, on a TTL line of the board."""
+
+    rig: SerialRig
+
+    def on(self) -> None:
+        """Switch on."""
+        self.rig.devices()
+        if self.rig.flood_line is None:
+            raise Refused("this rig has no floodlight: name its TTL line in the rig file")
+        self.rig.switch(self.rig.flood_line, True)
+
+    def off(self) -> None:
+        """Switch off; always allowed."""
+        if self.rig.flood_line is not None and self.rig.connected:
+            self.rig.switch(self.rig.flood_line, False)

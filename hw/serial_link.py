@@ -1,0 +1,148 @@
+"""The link to a device: opens its port, sends and receives bytes, knows how long to wait, and writes the byte log.
+
+Every protocol has a framer, a pure function object from bytes to messages, and an `Inbox` in front of the link that
+waits for messages. What a message means is the drivers' business (`hw.devices`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable
+from typing import Generic, Protocol, TypeVar
+
+import serial
+
+from hw.bytelog import ByteLog
+from hw.clock import Clock
+from hw.errors import Garbled, NoAnswer, Unplugged
+
+log = logging.getLogger(__name__)
+
+M = TypeVar("M")
+
+SLICE_S = 0.02  # a port is never waited for longer at a time: the precision of time limits
+WRITE_TIMEOUT_S = 1.0
+REMEDY = "check cable and power, and the port's name in the rig file (`disco-twin rig probe` lists what answers)"
+
+if "hw.ports" not in serial.protocol_handler_packages:
+    serial.protocol_handler_packages.append("hw.ports")
+
+
+class Framer(Protocol[M]):
+    """Cuts a stream of bytes, in whatever pieces it arrives, into messages."""
+
+    def feed(self, data: bytes) -> list[M]: ...
+    def reset(self) -> None:
+        """Forget an unfinished message."""
+
+
+class Link:
+    """An open port. `device` is what the rig calls the device, and begins every error."""
+
+    def __init__(self, url: str, baud: int, device: str, clock: Clock, log: ByteLog | None = None) -> None:
+        self.url, self.device, self.clock, self._log = url, device, clock, log
+        try:
+            self._port = serial.serial_for_url(
+                url, baudrate=baud, timeout=SLICE_S, write_timeout=WRITE_TIMEOUT_S, exclusive=True
+            )
+        except (OSError, ValueError) as error:
+            raise self._lost("cannot be opened", error) from error
+        self._note("open", b"")
+
+    def write(self, data: bytes) -> None:
+        """Send all bytes."""
+        try:
+            self._port.write(data)
+        except OSError as error:
+            raise self._lost("does not take bytes any more", error) from error
+        self._note(">", data)
+
+    def read(self, timeout_s: float) -> bytes:
+        """The bytes that arrive next, none if nothing arrives in time. With 0, what is there already."""
+        end = self.clock.now() + timeout_s
+        while True:
+            data = self._read_slice(wait=timeout_s > 0.0)
+            if data or self.clock.now() >= end:
+                return data
+
+    def _read_slice(self, wait: bool) -> bytes:
+        try:
+            there = self._port.in_waiting
+            data = bytes(self._port.read(max(1, there))) if there or wait else b""
+        except OSError as error:
+            raise self._lost("cannot be read any more", error) from error
+        if data:
+            self._note("<", data)
+        return data
+
+    def close(self) -> None:
+        """Give the port back and end the log; never raises, may be called twice."""
+        try:
+            self._port.close()
+        except OSError as error:
+            self._note("!", str(error).encode())
+        self._note("close", b"")
+        if self._log is not None:
+            self._log.close()
+            self._log = None
+
+    def _note(self, mark: str, data: bytes) -> None:
+        if self._log is not None:
+            self._log.note(self.clock.now(), mark, data)
+
+    def _lost(self, what: str, error: Exception) -> Unplugged:
+        return Unplugged(self.url, f"the port of {self.device}", f"{what} ({error})", REMEDY)
+
+
+class Inbox(Generic[M]):
+    """The messages that a device has sent and nobody has taken."""
+
+    def __init__(self, link: Link, framer: Framer[M]) -> None:
+        self._link, self._framer = link, framer
+        self._messages: deque[M] = deque()
+
+    def next(self, wanted: Callable[[M], bool], timeout_s: float) -> M | None:
+        """The first message that is wanted, or None in time; all others are dropped."""
+        clock = self._link.clock
+        end = clock.now() + timeout_s
+        while True:
+            while self._messages:
+                message = self._messages.popleft()
+                if wanted(message):
+                    return message
+            left = end - clock.now()
+            if left <= 0.0:
+                return None
+            self._messages.extend(self._framer.feed(self._link.read(left)))
+
+    def clear(self) -> None:
+        """Drop what has arrived by now: before a command, so that nothing older answers it."""
+        while data := self._link.read(0.0):
+            self._framer.feed(data)
+        self._framer.reset()
+        self._messages.clear()
+
+    def drain(self, quiet_s: float, limit_s: float = 5.0) -> bool:
+        """Drop everything until nothing has arrived for a while; False if the device does not fall silent."""
+        clock = self._link.clock
+        end = clock.now() + limit_s
+        while self._link.read(quiet_s):
+            if clock.now() > end:
+                return False
+        self.clear()
+        return True
+
+
+def persist(attempt: Callable[[], M], recover: Callable[[], None], tries: int = 3) -> M:
+    """Try what may be done twice (reading, or setting to a value) again when the answer was lost or garbled.
+
+    `recover` runs in between and makes sure that an answer to the lost attempt cannot answer the next one.
+    """
+    for _ in range(tries - 1):
+        try:
+            return attempt()
+        except (NoAnswer, Garbled) as error:
+            log.warning("%s; trying again", error.without_remedy)
+            recover()
+    return attempt()
