@@ -1,0 +1,180 @@
+"""pyserial's handler of `guard://PORT`: a port that belongs to a guard process (`hw.guard`), for lasers.
+
+Closing it, or ending in any way, switches the laser off. A signal that would end the program switches it off at once,
+even while the main thread is held up in a library or by the disk.
+"""
+
+from __future__ import annotations
+
+import array
+import contextlib
+import fcntl
+import logging
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import termios
+import threading
+import weakref
+from pathlib import Path
+
+from serial import PortNotOpenError, SerialBase, SerialException, SerialTimeoutException
+
+import hw
+from hw.guard import READY
+
+log = logging.getLogger(__name__)
+
+PREFIX = "guard://"
+START_S = 10.0  # a guard is a Python process
+END_S = 8.0  # it insists on an answer of the laser
+ENDING = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT})
+
+
+class Serial(SerialBase):
+    """The program's end of a guarded port."""
+
+    _host: socket.socket | None = None
+    _guard: subprocess.Popen[bytes] | None = None
+
+    def open(self) -> None:
+        """Start the guard, which opens the port and says off."""
+        url = str(self.port).removeprefix(PREFIX)
+        self._host, theirs = socket.socketpair()
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(hw.__path__[0]).parent), *sys.path[1:]])}
+        command = [sys.executable, "-m", "hw.guard", url, str(self.baudrate), str(theirs.fileno()), str(os.getpid())]
+        with theirs:
+            self._guard = subprocess.Popen(
+                command, pass_fds=[theirs.fileno()], env=environment, stdin=subprocess.DEVNULL, start_new_session=True
+            )
+        self._host.settimeout(START_S)
+        try:
+            said = self._host.recv(256)
+        except OSError as error:
+            said = str(error).encode()
+        if said != READY:
+            self._end()
+            raise SerialException(said.decode(errors="replace") or "the guard process did not start")
+        self.is_open = True
+        _WATCH.add(self)
+
+    def close(self) -> None:
+        """End the guard, which switches the laser off; a second time does nothing."""
+        if self.is_open:
+            self.is_open = False
+            _WATCH.discard(self)
+            self._end()
+
+    def trip(self) -> None:
+        """Have the laser switched off now; the port is dead from here on. Any thread."""
+        with contextlib.suppress(OSError):  # it is dead already
+            if self._host is not None:
+                self._host.shutdown(socket.SHUT_RDWR)
+
+    def _end(self) -> None:
+        self.trip()
+        if self._host is not None:
+            self._host.close()
+        if self._guard is not None:
+            try:
+                self._guard.wait(END_S)
+            except subprocess.TimeoutExpired:
+                log.warning("%s: the guard is still switching off", self.port)
+        self._host = self._guard = None
+
+    def _open_host(self) -> socket.socket:
+        if self._host is None:
+            raise PortNotOpenError
+        return self._host
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that can be read without waiting."""
+        count = array.array("i", [0])
+        try:
+            fcntl.ioctl(self._open_host(), termios.FIONREAD, count)
+        except OSError as error:
+            raise SerialException(str(error)) from error
+        return int(count[0])
+
+    def read(self, size: int = 1, /) -> bytes:
+        """At most `size` bytes within the port's timeout."""
+        host = self._open_host()
+        try:
+            if not select.select([host], [], [], self.timeout)[0]:
+                return b""
+            data = host.recv(size)
+        except OSError as error:
+            raise SerialException(str(error)) from error
+        if not data:
+            raise SerialException("the guard has closed it: the device was unplugged, or the laser switched off")
+        return data
+
+    def write(self, data: bytes, /) -> int:  # type: ignore[override]
+        """Hand over all bytes."""
+        host = self._open_host()
+        try:
+            host.settimeout(self.write_timeout)
+            host.sendall(data)
+        except TimeoutError as error:
+            raise SerialTimeoutException("the guard takes no bytes") from error
+        except OSError as error:
+            raise SerialException(f"the guard has closed it ({error.strerror})") from error
+        return len(data)
+
+    def reset_input_buffer(self) -> None:
+        """Forget what has arrived."""
+        waiting = self.in_waiting
+        if waiting:
+            self._open_host().recv(waiting)
+
+    def reset_output_buffer(self) -> None:
+        """Nothing waits to be sent: the guard takes everything at once."""
+
+    def flush(self) -> None:
+        """Nothing waits to be sent."""
+
+    def _reconfigure_port(self) -> None:
+        """The guard set the baud rate when it opened the port."""
+
+
+class _Watch:
+    """Trips every guarded port when a signal arrives that ends the program.
+
+    Python runs a signal's handler in the main thread, between two of its steps: too late where that thread waits for a
+    disk or a long computation. The number of the signal, however, is written to a descriptor at once, and a thread of
+    its own reads it there. Signals that the program ignores are not written.
+    """
+
+    def __init__(self) -> None:
+        self._ports: weakref.WeakSet[Serial] = weakref.WeakSet()
+        self._thread: threading.Thread | None = None
+
+    def add(self, port: Serial) -> None:
+        self._ports.add(port)
+        if self._thread is None and threading.current_thread() is threading.main_thread():
+            ours, theirs = socket.socketpair()
+            theirs.setblocking(False)
+            signal.set_wakeup_fd(theirs.detach(), warn_on_full_buffer=False)
+            self._thread = threading.Thread(target=self._run, args=(ours,), name="laser watch", daemon=True)
+            self._thread.start()
+
+    def discard(self, port: Serial) -> None:
+        self._ports.discard(port)
+
+    def _run(self, wakeup: socket.socket) -> None:
+        while numbers := wakeup.recv(64):
+            if ENDING.intersection(numbers):
+                for port in list(self._ports):
+                    port.trip()
+
+
+_WATCH = _Watch()
+
+
+def serial_class_for_url(url: str) -> tuple[str, type[Serial]]:
+    """What `serial.serial_for_url` asks a handler for."""
+    return url, Serial
