@@ -47,8 +47,8 @@ class CaptureReport:
 def capture(rig: Rig, plan: Plan, folder: Path, progress: Progress | None = None) -> CaptureReport:
     """Take the images of the plan that are not yet stored in the folder. The rig is safe whenever this ends.
 
-    Ctrl-C (or SIGTERM, SIGHUP) lets the image in progress finish, then raises `Interrupted`; a second one does not
-    wait. The folder of another plan is refused before the rig is switched on.
+    Ctrl-C (or SIGTERM, SIGHUP) is obeyed at once, since lasers must go out: the image in progress is dropped, to be
+    taken again, and `Interrupted` raised. The folder of another plan is refused before the rig is switched on.
     """
     _require_match(rig, plan)
     with StreamWriter(folder, plan) as stream:
@@ -83,15 +83,14 @@ def _sweep(rig: Rig, stream: StreamWriter, signals: _Signals, progress: Progress
     _restore(rig, stream)
     for index in range(len(stream), len(plan)):
         address = plan.address(index)
-        with signals.held():
-            if address.kind == "silhouette":
-                rig.turntable.move(plan.angles_rad[plan.angle_of(address.view)])
+        if address.kind == "silhouette":
+            rig.turntable.move(plan.angles_rad[plan.angle_of(address.view)])
         if address.kind == "spot" and announced != address.view:
-            # A simulated rig may compute for minutes here: not held, so that Ctrl-C is obeyed at once.
             rig.announce([plan.spots[i] for i in plan.spots_at(plan.angle_of(address.view))])
             announced = address.view
+        image = _take(rig, plan, address)
         with signals.held():
-            stream.append(address, *_take(rig, plan, address))
+            stream.append(address, *image)
         if progress is not None:
             progress(index + 1, len(plan))
 
@@ -152,10 +151,10 @@ def _interrupted(stream: StreamWriter) -> Interrupted:
 
 
 class _Signals:
-    """Turns SIGINT, SIGTERM and SIGHUP into KeyboardInterrupt, but not in the middle of an image.
+    """Turns SIGINT, SIGTERM and SIGHUP into KeyboardInterrupt, once, but not while an image is being stored.
 
-    Within `held` the first signal waits for the end of the block, the second one does not. A signal that is ignored
-    already (nohup) stays so. Outside the main thread Python delivers no signals, and this does nothing.
+    What follows the first is the end of the capture, and nothing interrupts that. A signal that is ignored already
+    (nohup) stays so. Outside the main thread Python delivers no signals, and this does nothing.
     """
 
     def __init__(self) -> None:
@@ -174,12 +173,14 @@ class _Signals:
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self._ignoring:
-            return
-        if self._asked or not self._holding:
-            raise KeyboardInterrupt
-        self._asked = True
-        log.info("stopping after this image")
+        if self._holding:
+            self._asked = True
+        elif not self._ignoring:
+            self._stop()
+
+    def _stop(self) -> None:
+        self._ignoring = True
+        raise KeyboardInterrupt
 
     def ignore(self) -> None:
         """From here on nothing interrupts: the rig is being made safe."""
@@ -187,11 +188,11 @@ class _Signals:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """A block that the first signal does not interrupt."""
+        """A block that is not interrupted; a signal that arrives in it counts at its end."""
         self._holding = True
         try:
             yield
         finally:
             self._holding = False
         if self._asked:
-            raise KeyboardInterrupt
+            self._stop()

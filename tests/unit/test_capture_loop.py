@@ -14,9 +14,11 @@ import pytest
 from capture_fakes import FakeRig, contents, fork, small_plan
 
 from hw.errors import DiscoError, InputError
+from hw.record import RawImage
+from pipeline.capture.layout import ImageMeta
 from pipeline.capture.loop import Interrupted, capture
-from pipeline.capture.plan import Plan
-from pipeline.capture.stream import StreamReader
+from pipeline.capture.plan import ImageAddress, Plan
+from pipeline.capture.stream import StreamReader, StreamWriter
 
 PLAN = small_plan()
 
@@ -99,11 +101,16 @@ def test_any_failure_leaves_the_rig_safe_and_resuming_gives_the_same_bytes(
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("at", [0, 1, 20, 47])
-def test_a_signal_stops_between_images(tmp_path: Path, finished: Path, number: signal.Signals, at: int) -> None:
-    """The image in progress is finished and stored; nothing is lost; handlers are put back."""
+def test_a_signal_stops_at_once(tmp_path: Path, finished: Path, number: signal.Signals, at: int) -> None:
+    """Lasers go out before the image is finished: it is dropped and taken again; handlers are put back."""
+
+    def interrupted(rig: FakeRig) -> None:
+        os.kill(os.getpid(), number)
+        pytest.fail("went on")
+
     before = signal.getsignal(number)
-    rig = FakeRig(PLAN, on_expose=after(at, lambda rig: os.kill(os.getpid(), number)))
-    with pytest.raises(Interrupted, match=f"stopped: {at + 1} of 48 images are stored") as caught:
+    rig = FakeRig(PLAN, on_expose=after(at, interrupted))
+    with pytest.raises(Interrupted, match=f"stopped: {at} of 48 images are stored") as caught:
         capture(rig, PLAN, tmp_path)
     assert isinstance(caught.value, DiscoError)
     assert signal.getsignal(number) is before
@@ -113,18 +120,36 @@ def test_a_signal_stops_between_images(tmp_path: Path, finished: Path, number: s
     assert contents(tmp_path) == contents(finished)
 
 
-def test_a_second_signal_does_not_wait_for_the_image(tmp_path: Path, finished: Path) -> None:
-    def twice(rig: FakeRig) -> None:
-        os.kill(os.getpid(), signal.SIGINT)
-        os.kill(os.getpid(), signal.SIGINT)
-        pytest.fail("went on")
+def test_a_signal_while_an_image_is_stored_waits_for_that(
+    tmp_path: Path, finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    append = StreamWriter.append
 
-    rig = FakeRig(PLAN, on_expose=after(5, twice))
-    with pytest.raises(Interrupted, match="stopped: 5 of 48"):
+    def interrupted(self: StreamWriter, address: ImageAddress, raw: RawImage, meta: ImageMeta) -> None:
+        if len(self) == 5:
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGINT)
+        append(self, address, raw, meta)
+
+    monkeypatch.setattr(StreamWriter, "append", interrupted)
+    rig = FakeRig(PLAN)
+    with pytest.raises(Interrupted, match="stopped: 6 of 48"):
         capture(rig, PLAN, tmp_path)
-    assert rig.dark
+    assert rig.dark and rig.made_safe
     capture(FakeRig(PLAN), PLAN, tmp_path)
     assert contents(tmp_path) == contents(finished)
+
+
+def test_a_second_signal_does_not_stop_the_rig_from_becoming_safe(tmp_path: Path) -> None:
+    class Rig(FakeRig):
+        def make_safe(self) -> None:
+            os.kill(os.getpid(), signal.SIGINT)
+            super().make_safe()
+
+    rig = Rig(PLAN, on_expose=after(5, lambda _: os.kill(os.getpid(), signal.SIGINT)))
+    with pytest.raises(Interrupted, match="stopped: 5 of 48"):
+        capture(rig, PLAN, tmp_path)
+    assert rig.dark and rig.made_safe == 2
 
 
 def test_a_signal_while_the_rig_works_ahead_is_obeyed_at_once(tmp_path: Path) -> None:
