@@ -1,0 +1,231 @@
+"""The rig file: which device hangs on which port, what is wired to what, and the limits of every axis.
+
+The scene says what the rig is (geometry, wavelengths, exposures that the pipeline is told); the rig file says which
+hardware makes it so. `port = "emulated"` puts an emulated device in the place of a real one, a camera of the kind
+`simulated` sees what the emulated and real devices light: any mixture works.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from hw.bracket import Bracket
+from hw.errors import DiscoError, InputError
+from hw.record import Sensor
+from pipeline.config import Strict, load_toml
+from pipeline.rig import RigConfig
+
+EMULATED = "emulated"
+PROJECTOR_STEPS = 4096  # of the board's 12-bit converters
+WAVELENGTH_TOLERANCE_NM = 10.0
+
+Positive = Annotated[float, Field(gt=0)]
+Line = Annotated[int, Field(ge=0, le=5)]
+Step = Annotated[int, Field(ge=0, lt=PROJECTOR_STEPS)]
+Port = Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class LaserDevice(Strict):
+    """One laser with its gate and its photodiode; in the order of the scene's lasers."""
+
+    kind: Literal["omicron"]
+    port: Port
+    wavelength_nm: Annotated[float, Field(ge=300, le=1100)]
+    power_mw: Annotated[float, Field(gt=0, le=500)]
+    baud: Literal[57600, 500000] = 500000
+    gate_line: Line  # the board's TTL line that opens the gate
+    photodiode_pin: Line
+    watts_per_count: Positive  # of laser power on the object, per count of the photodiode
+    photodiode_limits: tuple[Positive, Positive] = (0.5, 1.5)  # shares of the power; outside, the image is refused
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        low, high = self.photodiode_limits
+        if not low < 1 < high:
+            raise ValueError("photodiode_limits must enclose 1, as in [0.5, 1.5]")
+        if 1023 * self.watts_per_count < 1e-3 * self.power_mw:
+            raise ValueError("watts_per_count is too small: the photodiode's converter ends below power_mw")
+        return self
+
+
+class BoardDevice(Strict):
+    """Mirrors, gates, floodlight and photodiode amplifier. Limits keep the beam on the table."""
+
+    kind: Literal["mm-ard"]
+    port: Port
+    floodlight_line: Line
+    limits_u: tuple[Step, Step] = (0, PROJECTOR_STEPS - 1)
+    limits_v: tuple[Step, Step] = (0, PROJECTOR_STEPS - 1)
+    centre: tuple[Step, Step] = (PROJECTOR_STEPS // 2, PROJECTOR_STEPS // 2)  # where the mirrors stand at first
+
+
+class Turning(Strict):
+    """An axis: the table's own angle is `zero_deg + direction * angle of the rig`."""
+
+    port: Port
+    zero_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+    direction: Literal[1, -1] = 1
+    reach_s: Annotated[float, Field(gt=0, le=600)] = 20.0  # a move that takes longer has failed
+
+
+class ZaberDevice(Turning):
+    """A Zaber rotary stage, ASCII protocol."""
+
+    kind: Literal["zaber"]
+    microsteps_per_deg: Positive
+    device: Annotated[int, Field(ge=1, le=99)] = 1
+    axis: Annotated[int, Field(ge=1, le=9)] = 1
+
+
+class ElliptecDevice(Turning):
+    """A Thorlabs ELL14 or ELL18."""
+
+    kind: Literal["elliptec"]
+    address: Annotated[int, Field(ge=0, le=15)] = 0
+
+
+class GenicamDevice(Strict):
+    """A GenICam camera; `name` is the scene's. address: IP (GigE Vision) or serial number (USB3 Vision)."""
+
+    kind: Literal["genicam"]
+    name: str
+    address: Port
+    serial: str | None = None  # refuse another camera at this address
+    pixel_format: Annotated[str, Field(pattern=r"^Mono(10|12|14|16)[A-Za-z0-9]*$")] = "Mono12"
+
+
+class SimulatedCamera(Strict):
+    """The scene's camera of this name, simulated: needs the renderer."""
+
+    kind: Literal["simulated"]
+    name: str
+
+
+class SensorDevice(Strict):
+    """The sensor that all GenICam cameras share. Its exposures: longest_exposure_s * 2^-k, k in `exponents`."""
+
+    longest_exposure_s: Annotated[float, Field(gt=0, le=10)]
+    exponents: Annotated[tuple[Annotated[int, Field(ge=0, le=23)], ...], Field(min_length=1)] = tuple(range(12))
+    bits: Annotated[int, Field(ge=8, le=16)] = 12
+    saturation_dn: Annotated[int, Field(ge=1, le=65535)]  # linear below this
+    black_dn: Annotated[float, Field(ge=0)]
+    black_tolerance_dn: Positive = 2.0
+    gain_e_per_dn: Positive
+    read_noise_e: Annotated[float, Field(ge=0)]
+    dark_e_per_s: Annotated[float, Field(ge=0)] = 0.0
+    responsivity: tuple[Positive, ...]  # electrons/s per pixel for 1 W/(mm^2 sr), one a laser
+
+    def bracket(self) -> Bracket:
+        """The exposures."""
+        return Bracket(self.longest_exposure_s, self.exponents, self.bits, self.saturation_dn)
+
+    def sensor(self) -> Sensor:
+        """What the pipeline is told."""
+        return Sensor(
+            longest_exposure_s=self.longest_exposure_s,
+            steps=self.exponents[-1] + 1,
+            bits=self.bits,
+            gain_e_per_dn=self.gain_e_per_dn,
+            read_noise_e=self.read_noise_e,
+            dark_e_per_s=self.dark_e_per_s,
+            offset_dn=self.black_dn,
+            responsivity=self.responsivity,
+        )
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        try:
+            self.bracket()
+        except DiscoError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+
+class MeterDevice(Strict):
+    """A calibrated power meter in the beam, for the self-test alone."""
+
+    kind: Literal["ophir"]
+    port: Port
+
+
+class RigFile(Strict):
+    """Every device of a rig."""
+
+    format_version: Literal[1]
+    lasers: Annotated[tuple[LaserDevice, ...], Field(min_length=1, max_length=3)]
+    board: BoardDevice
+    turntable: Annotated[ZaberDevice | ElliptecDevice, Field(discriminator="kind")]
+    cameras: Annotated[
+        tuple[Annotated[GenicamDevice | SimulatedCamera, Field(discriminator="kind")], ...], Field(min_length=1)
+    ]
+    sensor: SensorDevice | None = None
+    power_meter: MeterDevice | None = None
+    warm_up_s: Annotated[float, Field(ge=0, le=3600)] = 60.0  # from emission to the first image
+    power_tolerance: Annotated[float, Field(gt=0, le=0.5)] = 0.1  # laser's own reading against power_mw
+
+    @model_validator(mode="after")
+    def _wired_once(self) -> Self:
+        lines = [laser.gate_line for laser in self.lasers] + [self.board.floodlight_line]
+        if len(set(lines)) < len(lines):
+            raise ValueError(f"gate_line and floodlight_line must be distinct TTL lines, found {lines}")
+        ports = [p for p in self.ports().values() if p != EMULATED]
+        if len(set(ports)) < len(ports):
+            raise ValueError(f"two devices share a port: {', '.join(sorted(p for p in ports if ports.count(p) > 1))}")
+        kinds = {camera.kind for camera in self.cameras}
+        if len(kinds) > 1:
+            raise ValueError("cameras must be all of the kind genicam or all simulated: they share one sensor")
+        if kinds == {"genicam"} and self.sensor is None:
+            raise ValueError("GenICam cameras need the table [sensor]")
+        if self.sensor is not None and len(self.sensor.responsivity) != len(self.lasers):
+            raise ValueError(f"sensor.responsivity needs {len(self.lasers)} values, one a laser")
+        return self
+
+    def ports(self) -> dict[str, str]:
+        """Name of the device -> its serial port."""
+        named = {f"laser {i} ({laser.wavelength_nm:g} nm)": laser.port for i, laser in enumerate(self.lasers)}
+        named |= {"board": self.board.port, "turntable": self.turntable.port}
+        return named | ({} if self.power_meter is None else {"power meter": self.power_meter.port})
+
+    @property
+    def all_emulated(self) -> bool:
+        """Whether no device with a port is real."""
+        return all(port == EMULATED for port in self.ports().values())
+
+    @property
+    def real_lasers(self) -> bool:
+        """Whether light can leave a real laser."""
+        return any(laser.port != EMULATED for laser in self.lasers)
+
+    @property
+    def simulated_cameras(self) -> bool:
+        """Whether the renderer is needed."""
+        return any(camera.kind == "simulated" for camera in self.cameras)
+
+
+def load_rig_file(path: Path) -> RigFile:
+    """Read and check a rig file."""
+    return load_toml(path, RigFile)
+
+
+def require_scene(rig: RigFile, scene: RigConfig, path: Path) -> None:
+    """Refuse a rig file that is not this scene's rig."""
+
+    def wrong(problem: str, key: str, value: object, allowed: object) -> InputError:
+        return InputError(problem, file=path, key=key, value=value, allowed=str(allowed))
+
+    if len(rig.lasers) != len(scene.lasers):
+        raise wrong("the scene has other lasers", "lasers", len(rig.lasers), len(scene.lasers))
+    for i, (laser, nominal) in enumerate(zip(rig.lasers, scene.lasers, strict=True)):
+        if abs(laser.wavelength_nm - nominal.wavelength_nm) > WAVELENGTH_TOLERANCE_NM:
+            allowed = f"{nominal.wavelength_nm:g} within {WAVELENGTH_TOLERANCE_NM:g}"
+            raise wrong("the scene has another laser", f"lasers[{i}].wavelength_nm", laser.wavelength_nm, allowed)
+    names = [camera.name for camera in rig.cameras]
+    expected = [camera.name for camera in scene.cameras]
+    if names != expected:
+        raise wrong("the scene has other cameras", "cameras", names, expected)
+    if scene.projector.steps != PROJECTOR_STEPS:
+        raise wrong("the board's mirrors have other steps than rig.projector.steps of the scene", "board",
+                    PROJECTOR_STEPS, scene.projector.steps)  # fmt: skip
