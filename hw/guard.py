@@ -19,6 +19,7 @@ import signal
 import socket
 import sys
 import time
+from dataclasses import dataclass
 from types import FrameType
 
 import serial
@@ -33,6 +34,25 @@ TICK_S = 0.02  # how often the parent is looked after
 ANSWER_S = 0.06  # emulated and real lasers answer within 30 ms
 RETURN_S = 600.0  # how long a port that vanished is waited for
 READY = b"\x06"
+ENDING = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT})
+
+
+@dataclass(frozen=True)
+class Program:
+    """The program that uses the laser. Into `signals` the numbers of its signals are written, as they arrive."""
+
+    pid: int
+    signals: socket.socket
+
+    def ending(self) -> str | None:
+        """Why the laser must go out, if it must."""
+        if os.getppid() != self.pid:
+            return "its program was killed"
+        try:  # the bytes stay where they are: the guards of all lasers look at the same ones
+            seen = self.signals.recv(4096, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return None
+        return "its program was told to end" if ENDING.intersection(seen) else None
 
 
 class _Stop(Exception):
@@ -51,12 +71,13 @@ def open_port(url: str, baud: int) -> serial.Serial:
             time.sleep(TICK_S)
 
 
-def relay(port: serial.Serial, host: socket.socket, parent: int) -> str:
+def relay(port: serial.Serial, host: socket.socket, program: Program) -> str:
     """Hand bytes to and fro until the program ends; why it ended. OSError: the port is gone."""
     while True:
         ready, _, _ = select.select([host.fileno(), port.fileno()], [], [], TICK_S)
-        if os.getppid() != parent:
-            return "its program was killed"
+        ending = program.ending()
+        if ending:
+            return ending
         if host.fileno() in ready:
             data = host.recv(4096)
             if not data:
@@ -108,17 +129,18 @@ def _off_when_it_returns(url: str, baud: int) -> bool:
     return False
 
 
-def guard(url: str, baud: int, host: socket.socket, parent: int) -> bool:
+def guard(url: str, baud: int, host: socket.socket, program: Program) -> bool:
     """Own the port until the program ends; True if the laser was switched off for certain."""
     try:
         port = open_port(url, baud)
-        port.write(OFF)
+        _answers(port, OFF, re.compile(rb"!(LOf)"))
+        port.reset_input_buffer()  # the program asked for none of this
     except (OSError, ValueError) as error:
         host.sendall(str(error).encode()[:200])
         return True
     try:
         host.sendall(READY)
-        reason = relay(port, host, parent)
+        reason = relay(port, host, program)
         log.info("%s: switching off: %s", url, reason)
         return switch_off(port)
     except _Stop:
@@ -137,14 +159,14 @@ def _told_to_end(number: int, frame: FrameType | None) -> None:
 
 
 def main() -> int:
-    """`python -m hw.guard URL BAUD SOCKET PARENT`; started by `hw.ports.protocol_guard` alone."""
-    url, baud, descriptor, parent = sys.argv[1], *map(int, sys.argv[2:5])
+    """`python -m hw.guard URL BAUD SOCKET SIGNALS PARENT`; started by `hw.ports.protocol_guard` alone."""
+    url, baud, descriptor, signals, parent = sys.argv[1], *map(int, sys.argv[2:6])
     logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s")
     signal.signal(signal.SIGTERM, _told_to_end)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the program, whose end is seen here
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    with socket.socket(fileno=descriptor) as host:
-        if guard(url, baud, host, parent):
+    with socket.socket(fileno=descriptor) as host, socket.socket(fileno=signals) as told:
+        if guard(url, baud, host, Program(parent, told)):
             return 0
     log.error("%s: THE LASER DOES NOT CONFIRM THAT IT IS OFF. Open the interlock or turn its key", url)
     return 1

@@ -18,7 +18,6 @@ import subprocess
 import sys
 import termios
 import threading
-import weakref
 from pathlib import Path
 
 from serial import PortNotOpenError, SerialBase, SerialException, SerialTimeoutException
@@ -31,7 +30,36 @@ log = logging.getLogger(__name__)
 PREFIX = "guard://"
 START_S = 10.0  # a guard is a Python process
 END_S = 8.0  # it insists on an answer of the laser
-ENDING = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT})
+
+
+class _Signals:
+    """The numbers of the signals that the program receives, where guards can look at them.
+
+    Python runs a signal's handler in the main thread between two of its steps: too late for a laser where that thread
+    waits for the disk or is inside a long computation. The signal's number, however, is written to a descriptor at
+    once. Signals that the program ignores are not.
+    """
+
+    def __init__(self) -> None:
+        self._pair: tuple[socket.socket, socket.socket] | None = None
+        self.guards = 0  # that look
+
+    def reader(self) -> int:
+        """The descriptor to look at."""
+        if self._pair is None:
+            self._pair = socket.socketpair()
+            for end in self._pair:
+                end.setblocking(False)
+        reader, writer = self._pair
+        if threading.current_thread() is threading.main_thread():
+            signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+        if not self.guards:
+            with contextlib.suppress(BlockingIOError):
+                reader.recv(4096)  # signals of before concern no laser that is opened now
+        return reader.fileno()
+
+
+_SIGNALS = _Signals()
 
 
 class Serial(SerialBase):
@@ -45,27 +73,29 @@ class Serial(SerialBase):
         url = str(self.port).removeprefix(PREFIX)
         self._host, theirs = socket.socketpair()
         environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(hw.__path__[0]).parent), *sys.path[1:]])}
-        command = [sys.executable, "-m", "hw.guard", url, str(self.baudrate), str(theirs.fileno()), str(os.getpid())]
+        shared = [theirs.fileno(), _SIGNALS.reader()]
+        _SIGNALS.guards += 1
+        command = [sys.executable, "-m", "hw.guard", url, str(self.baudrate), *map(str, shared), str(os.getpid())]
         with theirs:
             self._guard = subprocess.Popen(
-                command, pass_fds=[theirs.fileno()], env=environment, stdin=subprocess.DEVNULL, start_new_session=True
+                command, pass_fds=shared, env=environment, stdin=subprocess.DEVNULL, start_new_session=True
             )
         self._host.settimeout(START_S)
         try:
-            said = self._host.recv(256)
+            said = self._host.recv(1)  # what follows READY is the laser's
+            if said != READY:
+                said += self._host.recv(256)
         except OSError as error:
             said = str(error).encode()
         if said != READY:
             self._end()
             raise SerialException(said.decode(errors="replace") or "the guard process did not start")
         self.is_open = True
-        _WATCH.add(self)
 
     def close(self) -> None:
         """End the guard, which switches the laser off; a second time does nothing."""
         if self.is_open:
             self.is_open = False
-            _WATCH.discard(self)
             self._end()
 
     def trip(self) -> None:
@@ -78,6 +108,7 @@ class Serial(SerialBase):
         self.trip()
         if self._host is not None:
             self._host.close()
+            _SIGNALS.guards -= 1
         if self._guard is not None:
             try:
                 self._guard.wait(END_S)
@@ -139,40 +170,6 @@ class Serial(SerialBase):
 
     def _reconfigure_port(self) -> None:
         """The guard set the baud rate when it opened the port."""
-
-
-class _Watch:
-    """Trips every guarded port when a signal arrives that ends the program.
-
-    Python runs a signal's handler in the main thread, between two of its steps: too late where that thread waits for a
-    disk or a long computation. The number of the signal, however, is written to a descriptor at once, and a thread of
-    its own reads it there. Signals that the program ignores are not written.
-    """
-
-    def __init__(self) -> None:
-        self._ports: weakref.WeakSet[Serial] = weakref.WeakSet()
-        self._thread: threading.Thread | None = None
-
-    def add(self, port: Serial) -> None:
-        self._ports.add(port)
-        if self._thread is None and threading.current_thread() is threading.main_thread():
-            ours, theirs = socket.socketpair()
-            theirs.setblocking(False)
-            signal.set_wakeup_fd(theirs.detach(), warn_on_full_buffer=False)
-            self._thread = threading.Thread(target=self._run, args=(ours,), name="laser watch", daemon=True)
-            self._thread.start()
-
-    def discard(self, port: Serial) -> None:
-        self._ports.discard(port)
-
-    def _run(self, wakeup: socket.socket) -> None:
-        while numbers := wakeup.recv(64):
-            if ENDING.intersection(numbers):
-                for port in list(self._ports):
-                    port.trip()
-
-
-_WATCH = _Watch()
 
 
 def serial_class_for_url(url: str) -> tuple[str, type[Serial]]:
