@@ -5,8 +5,9 @@ all samples, s the size of what it leaves unexplained, and G a smooth symmetric 
 G solves one symmetric positive definite system: the samples at the spots' barycentric points bind columns and, by
 reciprocity, rows; smoothness over the surface on both sides fills the rest. Values are compared with their expectation
 linearly and weighted by precision (`Measured.residual`), so that a noisy tail neither dominates nor turns negative.
-Samples bind the fit, they are not copied into it: at a spot the model differs from the sample by the sample's noise and
-an assumed scatter of R_d below the mesh's resolution (`profile.scatter`); see docs/decisions/0013.
+
+The fit fills what was not measured. An entry next to a spot holds the sample itself (`hold_measured`), wherever noise
+leaves it more certain than the fill: nothing that was measured is overwritten (docs/decisions/0013).
 """
 
 from __future__ import annotations
@@ -21,25 +22,27 @@ from scipy import sparse
 from pipeline.reconstruct.exitance import measure_boundary
 from pipeline.reconstruct.harmonics import Harmonics, harmonics
 from pipeline.reconstruct.model import ReflectanceModel
-from pipeline.reconstruct.profile import Measured, fit_profile, scatter
-from pipeline.reconstruct.samples import Samples
+from pipeline.reconstruct.profile import Measured, Tilt, fit_profile, scatter
+from pipeline.reconstruct.samples import ANGULAR, Glow, Samples
+from pipeline.reconstruct.spots import outward_tilt
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 
 log = logging.getLogger(__name__)
 
-RANGE_EDGES = 1.3  # correlation length of G in edges; fitted on the quick scene against its truth
-NEAR, FAR, TURN_MM = 0.08, 0.6, 6.0  # s(distance): relative deviation of R_d from the profile
+# Chosen by leaving a fifth of the spots out, without the truth (docs/decisions/0013); lengths in edges of the scan.
+RANGE_EDGES = 2.0  # correlation length of G
+NEAR, FAR, TURN_EDGES = 0.08, 0.6, 3.6  # s(distance): relative deviation of R_d from the profile
 ROUNDS = 2  # of Gauss-Newton, for each of as many fits of the profile
 TOLERANCE = 1e-2  # of conjugate gradients; every solve starts from the one before
 MOST_STEPS = 300
 MOST_HARMONICS = 500
 
 
-def deviation(distance: F64) -> F64:
-    """s: standard deviation of log R_d about the radial profile, by distance in mm."""
-    return np.asarray(NEAR + (FAR - NEAR) * -np.expm1(-((distance / TURN_MM) ** 2)))
+def deviation(edges: F64) -> F64:
+    """s: standard deviation of log R_d about the radial profile, by distance in edges."""
+    return np.asarray(NEAR + (FAR - NEAR) * -np.expm1(-((edges / TURN_EDGES) ** 2)))
 
 
 @dataclass(frozen=True)
@@ -98,38 +101,73 @@ class SymmetricField:
         return y
 
 
-def measured_of(samples: Samples, laser: int) -> Measured:
-    """One laser's samples for the fits; 0 where unobserved."""
-    observed = np.isfinite(samples.values[laser])
-    value, dark, noise = (
-        np.where(observed, a[laser], 0.0).astype(np.float64)
-        for a in (samples.values, samples.dark_variance, samples.noise_per_signal)
-    )
-    return Measured(value, observed, dark, noise)
+@dataclass(frozen=True)
+class Fit:
+    """One laser's smooth model.
 
-
-def complete_laser(samples: Samples, laser: int, field: SymmetricField, start: F32) -> tuple[F64, F64, F32]:
-    """One laser: (V, V) completed R_d, symmetric and positive, (S, V) R_d at the spots, both in mm^-2, and Y.
-
-    start: (n, n) first guess of Y, the laser's before.
+    entries: (V, V) R_d, symmetric and positive; at_spots: (S, V) the same between beams and vertices; both in mm^-2,
+    means over all directions; tilt: how single directions depart from them; field: (n, n) Y
     """
-    pairs, vertex_pairs = samples.spot_pairs, samples.vertex_pairs
-    measured = measured_of(samples, laser)
+
+    entries: F64
+    at_spots: F64
+    tilt: Tilt
+    field: F32
+
+
+def fit_laser(samples: Samples, laser: int, field: SymmetricField, start: F32) -> Fit:
+    """The profile and the field in turn. start: (n, n) first guess of Y, the laser's before."""
+    pairs, vertex_pairs, measured = samples.spot_pairs, samples.vertex_pairs, Measured.of(samples, laser)
     edge = float(samples.mesh.edges_unique_length.mean())
-    scale, y = deviation(pairs.distance), start
-    fit = field.at_spots(y).astype(np.float64)
-    profile = None
+    scale, y, profile = deviation(measured.edges), start, None
+    smooth = scale * field.at_spots(y)
     for _ in range(ROUNDS):
-        profile = fit_profile(pairs, measured, edge, scale * fit, start=profile)
-        prior = pairs.mean(profile)
+        profile, tilt = fit_profile(pairs, measured, edge, samples.tilt, smooth, profile)
+        prior, leaning = pairs.mean(profile), tilt(pairs.distance) * samples.tilt
         for _ in range(ROUNDS):
-            relative, weight = measured.residual(prior * np.exp(scale * fit), pairs.distance)
-            y = field.solve(relative + scale * fit, weight, scale, y)
-            fit = field.at_spots(y).astype(np.float64)
-    kernel = vertex_pairs.mean(fit_profile(pairs, measured, edge, scale * fit, samples.tilt, profile))
-    exponent = deviation(vertex_pairs.distance) * (field.vertices @ y @ field.vertices.T)
-    complete = 0.5 * (kernel + kernel.T) * np.exp(0.5 * (exponent + exponent.T))
-    return complete, prior * np.exp(scale * fit), y
+            relative, weight = measured.residual(prior * np.exp(smooth + leaning))
+            y = field.solve(relative + smooth, weight, scale, y)
+            smooth = scale * field.at_spots(y)
+    profile, tilt = fit_profile(pairs, measured, edge, samples.tilt, smooth, profile)
+    kernel = vertex_pairs.mean(profile)
+    exponent = deviation(vertex_pairs.distance / edge) * (field.vertices @ y @ field.vertices.T)
+    entries = 0.5 * (kernel + kernel.T) * np.exp(0.5 * (exponent + exponent.T))
+    return Fit(entries, pairs.mean(profile) * np.exp(smooth), tilt, y)
+
+
+def hold_measured(samples: Samples, fits: list[Fit]) -> tuple[F64, F64, NDArray[np.bool_]]:
+    """(L, V, V) R_d that holds the samples where they are good, its relative variance, and (V, V) where that is.
+
+    A sample is the mean over a beam and a hat function in one direction, an entry the mean over two hat functions and
+    all directions. The fit says what lies between: sample / its expectation = entry / its expectation. Spots whose
+    triangle the vertex belongs to are averaged by their share and precision, and by reciprocity from both sides. Held
+    are entries whose noise has at most half the variance of the scatter that is assumed about the fit, in all lasers.
+    """
+    used = np.flatnonzero(samples.spots.transmitted > 0)
+    share = sparse.csr_array(
+        (
+            samples.spots.barycentric[used].ravel(),
+            (samples.mesh.faces[samples.spots.triangle[used]].ravel(), np.repeat(used, 3)),
+        ),
+        shape=(len(samples.mesh.vertices), len(samples.values[0])),
+    )
+    squared, edge = share.multiply(share).tocsr(), float(samples.mesh.edges_unique_length.mean())
+    limit = 0.5 * scatter(samples.vertex_pairs.distance / edge) ** 2
+    ratios, variances, held = [], [], measured_entries(samples)
+    for laser, fit in enumerate(fits):
+        measured = Measured.of(samples, laser)
+        expected = fit.at_spots * np.exp(fit.tilt(samples.spot_pairs.distance) * samples.tilt)
+        variance = measured.variance(expected)
+        weight = np.where(measured.observed, 1.0 / (variance + ANGULAR**2), 0.0)
+        ratio = share @ (weight * np.where(measured.observed, measured.value / expected, 0.0))
+        total = share @ weight
+        spread = squared @ (weight**2 * variance)
+        total = np.maximum(total + total.T, 1e-30)
+        ratios.append((ratio + ratio.T) / total)
+        variances.append((spread + spread.T) / total**2)
+        held &= (variances[-1] < limit) & (ratios[-1] > 0)
+    entries = np.stack([fit.entries * np.where(held, ratio, 1.0) for fit, ratio in zip(fits, ratios, strict=True)])
+    return entries, np.stack(variances) + ANGULAR**2, held
 
 
 def unexplained(samples: Samples, basis: Harmonics, range_mm: float) -> F64:
@@ -141,7 +179,7 @@ def unexplained(samples: Samples, basis: Harmonics, range_mm: float) -> F64:
     used = samples.spots.transmitted > 0
     to_spots = samples.lit[np.flatnonzero(used)]
     cross = to_spots @ covariance  # (S, V)
-    noise = (scatter(np.zeros(1)) / NEAR) ** 2
+    noise = (ANGULAR / NEAR) ** 2
     gain = np.linalg.solve(cross @ to_spots.T + noise * np.eye(len(cross)), cross)
     explained = (cross * gain).sum(axis=0) / np.diag(covariance)
     share = np.abs(gain) / np.maximum(np.abs(gain).sum(axis=0), 1e-12)
@@ -160,22 +198,26 @@ def measured_entries(samples: Samples) -> NDArray[np.bool_]:
 
 def complete(samples: Samples) -> ReflectanceModel:
     """The default method: samples -> model."""
-    range_mm = RANGE_EDGES * float(samples.mesh.edges_unique_length.mean())
+    edge = float(samples.mesh.edges_unique_length.mean())
     basis = harmonics(samples.mesh, MOST_HARMONICS)
-    field = SymmetricField.of(basis, samples.lit, range_mm)
-    y, found, at_spots = np.zeros_like(field.penalty), [], []
+    field = SymmetricField.of(basis, samples.lit, RANGE_EDGES * edge)
+    fits: list[Fit] = []
     for laser in range(len(samples.values)):
-        entries, at_spot, y = complete_laser(samples, laser, field, y)
-        found.append(entries)
-        at_spots.append(at_spot)
-    reflectance = np.stack(found)
-    distance = samples.vertex_pairs.distance
-    relative = deviation(distance) ** 2 * unexplained(samples, basis, range_mm) + scatter(distance) ** 2
+        fits.append(fit_laser(samples, laser, field, fits[-1].field if fits else np.zeros_like(field.penalty)))
+    reflectance, relative, held = hold_measured(samples, fits)
+    edges = samples.vertex_pairs.distance / edge
+    filled = deviation(edges) ** 2 * unexplained(samples, basis, RANGE_EDGES * edge) + scatter(edges) ** 2
+
+    def expected(glow: Glow) -> F64:
+        tilt = sum(outward_tilt(samples.mesh, samples.spots, glow.camera.position))
+        distance = samples.spot_pairs.distance
+        return np.stack([fit.at_spots * np.exp(fit.tilt(distance) * tilt) for fit in fits])
+
     return ReflectanceModel(
         samples.mesh,
         reflectance.astype(np.float32),
-        (reflectance**2 * relative).astype(np.float32),
-        measured_entries(samples),
-        measure_boundary(samples.mesh, samples.eta, samples.glow, np.stack(at_spots)),
+        (reflectance**2 * np.where(held, relative, filled)).astype(np.float32),
+        held,
+        measure_boundary(samples.mesh, samples.eta, samples.glow, expected),
         {"method": "default"},
     )

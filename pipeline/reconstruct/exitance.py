@@ -8,6 +8,8 @@ model expects; by reciprocity the ratio holds for light that enters, too.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -45,11 +47,17 @@ def _accumulate(mesh: trimesh.Trimesh, glow: Glow, radiosity: F64, eta: float) -
     return np.bincount(at, seen, bins).astype(np.float64), np.bincount(at, smooth * model, bins).astype(np.float64)
 
 
-def measure_boundary(mesh: trimesh.Trimesh, eta: float, glows: tuple[Glow, ...], expected: F64) -> Boundary:
-    """The boundary with its measured ratio. expected: (L, S, V) the model's R_d between spots and vertices."""
+def measure_boundary(
+    mesh: trimesh.Trimesh, eta: float, glows: tuple[Glow, ...], expected: Callable[[Glow], F64]
+) -> Boundary:
+    """The boundary with its measured ratio.
+
+    expected: view -> (L, S, V) the model's R_d between spots and vertices, as seen from there. What directions do
+    beside the boundary must be in it, or the ratio would take it for the boundary's.
+    """
     seen, model = np.zeros(len(EDGES) - 1), np.zeros(len(EDGES) - 1)
     for glow in glows:
-        radiosity = np.einsum("ls,lsv->lv", glow.included.astype(np.float64), expected)
+        radiosity = np.einsum("ls,lsv->lv", glow.included.astype(np.float64), expected(glow))
         s, m = _accumulate(mesh, glow, radiosity, eta)
         seen += s
         model += m

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.calibrate.calibration import Calibration
-from pipeline.reconstruct.completion import measured_of
 from pipeline.reconstruct.mesh import vertex_areas
+from pipeline.reconstruct.profile import Measured
 from pipeline.reconstruct.samples import Samples
 
 LOCAL_SHARE = 0.99  # of the observed light within one edge: nothing is left for a global term
@@ -33,7 +33,7 @@ def share_within_an_edge(samples: Samples) -> float:
     edge = float(samples.mesh.edges_unique_length.mean())
     near = samples.spot_pairs.distance < edge + samples.spots.beam_radius
     area = vertex_areas(samples.mesh)
-    power = np.stack([measured_of(samples, k).value * area for k in range(len(samples.values))])
+    power = np.stack([Measured.of(samples, k).value * area for k in range(len(samples.values))])
     return float(power[:, near].sum() / max(power.sum(), 1e-30))
 
 

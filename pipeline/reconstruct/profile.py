@@ -15,42 +15,64 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from pipeline.reconstruct.distances import Pairs
+from pipeline.reconstruct.samples import ANGULAR, Samples
 
 F64 = NDArray[np.float64]
 
-NEAR_SCATTER = 0.1  # relative scatter of R_d about a smooth model, near the spot: position, shape, detail
-FAR_SCATTER = 0.3  # and how it grows with log(1 + distance / SCATTER_MM)
-SCATTER_MM = 5.0
+FAR_SCATTER = 0.3  # how the relative scatter of R_d about a smooth model grows with log(1 + edges / SCATTER_EDGES)
+SCATTER_EDGES = 3.0
 OUTLIER = 3.0  # standard deviations from which on a value counts less (Huber)
 LARGEST_STEP = 2.0  # relative: what lies further from its expectation is taken to lie here
 ITERATIONS = 12
+TILT_EDGES = (0.5, 2.0, 4.5, 10.0)
 ENOUGH = 3e-3  # change of log f at which the fit ends
 
 
 @dataclass(frozen=True)
 class Measured:
-    """One laser's samples, (S, V) each: value mm^-2 (0 where unobserved), observed, dark variance, noise per signal."""
+    """One laser's samples, (S, V) each.
+
+    value: mm^-2, 0 where unobserved; observed; dark: variance without signal, mm^-4; noise: variance per signal, mm^-2;
+    oblique: relative variance from obliqueness; edges: distance from spot to vertex in edges of the scan
+    """
 
     value: F64
     observed: NDArray[np.bool_]
     dark: F64
     noise: F64
+    oblique: F64
+    edges: F64
 
-    def residual(self, expected: F64, distance: F64) -> tuple[F64, F64]:
+    @classmethod
+    def of(cls, samples: Samples, laser: int) -> Measured:
+        """One laser's part of the samples."""
+        observed = np.isfinite(samples.values[laser])
+        value, dark, noise = (
+            np.where(observed, a[laser], 0.0).astype(np.float64)
+            for a in (samples.values, samples.dark_variance, samples.noise_per_signal)
+        )
+        edges = samples.spot_pairs.distance / float(samples.mesh.edges_unique_length.mean())
+        return cls(value, observed, dark, noise, samples.oblique.astype(np.float64), edges)
+
+    def variance(self, expected: F64) -> F64:
+        """Relative variance of a sample of this expectation by noise and obliqueness."""
+        return np.asarray((self.dark + self.noise * expected) / expected**2 + self.oblique)
+
+    def residual(self, expected: F64) -> tuple[F64, F64]:
         """Relative residual value / expected - 1 and its weight (0 where unobserved), outliers bounded.
 
         The bounds are symmetric in units of the noise: noise that drowns a signal must not raise it.
         """
         relative = np.where(self.observed, self.value / expected - 1.0, 0.0)
-        deviation = np.sqrt((self.dark + self.noise * expected) / expected**2 + scatter(distance) ** 2)
+        deviation = np.sqrt(self.variance(expected) + scatter(self.edges) ** 2)
         weight = np.where(self.observed, 1.0 / deviation**2, 0.0)
         bound = np.maximum(LARGEST_STEP, OUTLIER * deviation)
         return np.clip(relative, -bound, bound), weight / np.maximum(np.abs(relative) / (OUTLIER * deviation), 1.0)
 
 
-def scatter(distance: F64) -> F64:
-    """Relative scatter of true R_d about a smooth model, by distance in mm."""
-    return np.asarray(NEAR_SCATTER + FAR_SCATTER * np.log1p(distance / SCATTER_MM))
+def scatter(edges: F64) -> F64:
+    """Relative scatter of R_d about a smooth model, by distance in edges: direction, position, shape, detail."""
+    return np.asarray(ANGULAR + FAR_SCATTER * np.log1p(edges / SCATTER_EDGES))
 
 
 @dataclass(frozen=True)
@@ -94,47 +116,56 @@ def _start(profile: Profile, measured: Measured, distance: F64) -> F64:
     return np.asarray(np.linalg.solve(basis.T @ basis + 1e-2 * bend.T @ bend, basis.T @ np.array(level)))
 
 
-def _tilt_basis(tilt: F64, distance: F64, edge: float) -> F64:
-    """(S, V, 4) the tilt, times hat functions of log distance."""
-    knots = np.log(edge * np.array([0.5, 2.0, 4.5, 10.0]))
-    at = np.log(np.maximum(distance, 0.1 * edge))
-    return np.stack([np.interp(at, knots, one) * tilt for one in np.eye(len(knots))], axis=-1)
+@dataclass(frozen=True)
+class Tilt:
+    """log R_d seen in a direction is that over all directions + slope(distance) * `outward_tilt`.
+
+    Light that has not lost its direction leaves ahead: more is seen along its way than against it, and on a convex
+    object cameras look against it. `slopes` are at TILT_EDGES edges of length `edge` (mm), linear in log distance.
+    """
+
+    edge: float
+    slopes: F64
+
+    @staticmethod
+    def basis(distance: F64, edge: float) -> F64:
+        """(..., 4) hat functions of log distance."""
+        knots = np.log(edge * np.array(TILT_EDGES))
+        at = np.log(np.maximum(distance, 0.1 * edge))
+        return np.stack([np.interp(at, knots, one) for one in np.eye(len(knots))], axis=-1)
+
+    def __call__(self, distance: F64) -> F64:
+        """The slope at distances in mm."""
+        return np.asarray(self.basis(distance, self.edge) @ self.slopes)
 
 
 def fit_profile(
-    pairs: Pairs,
-    measured: Measured,
-    edge: float,
-    offset: F64 | float = 0.0,
-    tilt: F64 | None = None,
-    start: Profile | None = None,
-) -> Profile:
-    """Fit f so that exp(offset) * (mean of f over the pairs' patches) meets the values; offset is (S, V) or 0.
+    pairs: Pairs, measured: Measured, edge: float, tilt: F64, offset: F64 | float = 0.0, start: Profile | None = None
+) -> tuple[Profile, Tilt]:
+    """Fit f and the tilt's slopes so that exp(offset + slope * tilt) * (mean of f over the patches) meets the values.
 
-    Light that has not lost its direction leaves ahead: more is seen along its way than against it, and on a convex
-    object cameras look against it. With the samples' `tilt` (S, V) a factor exp(b(distance) * tilt) is fitted too and
-    left out of f, which then is the mean over all directions. `start` is a first guess.
+    tilt: (S, V) of the samples; offset: (S, V) or 0; start: a first guess. f is the mean over all directions.
     """
     knots = _knots(edge, float(pairs.distance.max()) * 1.01)
     profile = start or Profile(knots, _start(Profile(knots, np.zeros(len(knots) - 4)), measured, pairs.distance))
     near_basis, basis = profile.basis(pairs.centres), profile.basis(pairs.distance)
     n = basis.shape[2]
-    slopes = np.zeros((*pairs.distance.shape, 0)) if tilt is None else _tilt_basis(tilt, pairs.distance, edge)
-    factor = np.zeros(slopes.shape[2])
+    leaning = Tilt.basis(pairs.distance, edge) * tilt[:, :, None]
+    slopes = np.zeros(leaning.shape[2])
     bend = np.diff(np.eye(n), 2, axis=0)
-    stiff = np.eye(n + len(factor))
+    stiff = np.eye(n + len(slopes))
     stiff[:n, :n] = bend.T @ bend
     for _ in range(ITERATIONS):
         expected = pairs.mean(profile)
         jacobian = basis.copy()
         slope = pairs.histogram @ (profile(pairs.centres)[:, None] * near_basis)
         jacobian[pairs.first, pairs.second] = slope / expected[pairs.first, pairs.second][:, None]
-        relative, weight = measured.residual(expected * np.exp(offset + slopes @ factor), pairs.distance)
-        flat, w = np.concatenate([jacobian, slopes], axis=2).reshape(-1, len(stiff)), weight.ravel()
-        now = np.concatenate([profile.coefficients, factor])
+        relative, weight = measured.residual(expected * np.exp(offset + leaning @ slopes))
+        flat, w = np.concatenate([jacobian, leaning], axis=2).reshape(-1, len(stiff)), weight.ravel()
+        now = np.concatenate([profile.coefficients, slopes])
         step = np.linalg.solve((flat * w[:, None]).T @ flat + stiff, flat.T @ (w * relative.ravel()) - stiff @ now)
         step *= min(1.0, 2.0 / np.abs(step).max())
-        profile, factor = Profile(knots, now[:n] + step[:n]), now[n:] + step[n:]
+        profile, slopes = Profile(knots, now[:n] + step[:n]), now[n:] + step[n:]
         if np.abs(step).max() < ENOUGH:
             break
-    return profile
+    return profile, Tilt(edge, slopes)

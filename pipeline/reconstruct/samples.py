@@ -32,6 +32,9 @@ F32 = NDArray[np.float32]
 log = logging.getLogger(__name__)
 
 MIN_SHARE = 0.5  # of a vertex's hat that a camera must see
+# Relative scatter of samples of one entry that differ in direction: all of them, and what oblique ones add. Measured as
+# the spread about a completed quick scene within two edges of the spots (docs/decisions/0013).
+ANGULAR, OBLIQUE = 0.1, 0.5
 # Its response to white noise has the noise's variance, and none to a linear slope (Immerkaer 1996).
 NOISE_MASK = np.outer([1, -2, 1], [1, -2, 1]) / 6.0
 
@@ -54,6 +57,7 @@ class Samples:
 
     values: (L, S, V) mm^-2, NaN where not observed; averaged over the hat function of the vertex and over the beam
     dark_variance, noise_per_signal: (L, S, V); an entry of expectation m has variance dark + per_signal * m
+    oblique: (S, V) relative variance that obliqueness adds at both ends (`oblique_variance`)
     tilt: (S, V) sum of `outward_tilt` at both ends, mean over the cameras
     glow: per view, images summed over its spots
     """
@@ -64,6 +68,7 @@ class Samples:
     values: F32
     dark_variance: F32
     noise_per_signal: F32
+    oblique: F32
     tilt: F64
     glow: tuple[Glow, ...] = ()
 
@@ -101,13 +106,21 @@ class SampleStatistics:
     coverage: float
 
 
+def oblique_variance(cosine: NDArray[np.floating]) -> F64:
+    """Relative variance of a sample whose laser or camera meets the surface at this cosine; it grows fast below .5."""
+    return np.asarray(OBLIQUE**2 * (1.0 - np.clip(cosine, 0.0, 1.0)) ** 8, np.float64)
+
+
 def noise_squared(image: NDArray[np.floating]) -> F64:
     """(H, W) local estimate of each pixel's noise variance from its 3 x 3 neighbourhood, exact on average."""
     return np.asarray(ndimage.convolve(np.asarray(image, np.float64), NOISE_MASK, mode="nearest") ** 2)
 
 
 class _Gathered:
-    """Readings of all spots by all cameras: (L, S, C, V) arrays for one way of reading."""
+    """Readings of all spots by all cameras: (L, S, C, V) arrays for one way of reading.
+
+    value in mm^-2; its variance in mm^-4: dark, without signal; noise, as the image shows; shot, by the camera's model
+    """
 
     def __init__(self, lasers: int, plan: Plan, readings: list[Reading]) -> None:
         cameras, vertices = len(plan.cameras), readings[0].operator.shape[0]
@@ -118,6 +131,7 @@ class _Gathered:
         self.value = np.full(shape, np.nan, np.float32)
         self.dark = np.zeros(shape, np.float32)
         self.noise = np.zeros(shape, np.float32)
+        self.shot = np.zeros(shape, np.float32)
 
     def add(self, address: ImageAddress, image: RadianceImage, noise: F64, scale: float) -> None:
         view, camera = address.view, self.plan.camera_of(address.view)
@@ -129,40 +143,81 @@ class _Gathered:
             seen &= self.touched[view] @ image.saturated.ravel().astype(np.float64) == 0
         self.value[at] = np.where(seen, value, np.nan)
         self.dark[at] = self.squared[view] @ np.full(noise.size, float(image.variance.min())) * scale**2
-        self.noise[at] = self.squared[view] @ np.maximum(noise.ravel(), image.variance.ravel()) * scale**2
+        self.noise[at] = self.squared[view] @ noise.ravel() * scale**2
+        self.shot[at] = self.squared[view] @ image.variance.ravel() * scale**2
 
     def noise_per_signal(self) -> F32:
-        """(L, S, C, V) variance per signal; a property of laser, view and vertex, so averaged over a view's spots."""
+        """(L, S, C, V) variance per signal; a property of laser, view and vertex, so averaged over a view's spots.
+
+        As seen in the images, but not less than what the camera's own model says.
+        """
         out = np.zeros_like(self.value)
         for angle in range(len(self.plan.angles_rad)):
             spots = self.plan.spots_at(angle)
             part = np.s_[:, spots.start : spots.stop]
-            extra = np.maximum(self.noise[part] - self.dark[part], 0.0)
             signal = np.where(np.isfinite(self.value[part]), np.maximum(self.value[part], 0.0), 0.0)
-            total = signal.sum(axis=1, keepdims=True)
-            mean = extra.sum(axis=(1, 3), keepdims=True) / np.maximum(signal.sum(axis=(1, 3), keepdims=True), 1e-30)
-            own = extra.sum(axis=1, keepdims=True) / np.maximum(total, 1e-30)
-            out[part] = np.where(total > 0, own, mean)
+            # Clipped after the mean: single estimates scatter to both sides, and clipping each would raise them all.
+            seen, own = (
+                np.maximum(v[part].sum(axis=1, keepdims=True) - self.dark[part].sum(axis=1, keepdims=True), 0.0)
+                for v in (self.noise, self.shot)
+            )
+            extra, total = np.maximum(seen, own), signal.sum(axis=1, keepdims=True)
+            mean = extra.sum(axis=3, keepdims=True) / np.maximum(total.sum(axis=3, keepdims=True), 1e-30)
+            out[part] = np.where(total > 0, extra / np.maximum(total, 1e-30), mean)
         return out
 
+    def expected(self, distance: F64) -> F64:
+        """(L, S, V) what a sample is about, mm^-2: the mean over all that lie as far from their spots (`distance`).
+
+        Weights must not come from the samples that they weigh: low ones would seem precise.
+        """
+        count = 40
+        edges = np.quantile(distance, np.linspace(0, 1, count + 1))
+        group = np.clip(np.searchsorted(edges, distance) - 1, 0, count - 1).ravel()
+        out = []
+        for value in self.value:
+            seen = np.isfinite(value)
+            n = np.bincount(group, seen.sum(axis=1).ravel(), count)
+            total = np.bincount(group, np.where(seen, value, 0.0).sum(axis=1, dtype=np.float64).ravel(), count)
+            mean = total / np.maximum(n, 1)
+            out.append(np.maximum(mean, 1e-6 * max(mean.max(), 1e-30))[group].reshape(distance.shape))
+        return np.stack(out)
+
     def combined(self, mesh: trimesh.Trimesh, eta: float, spots: Spots, glow: tuple[Glow, ...]) -> Samples:
-        """One value per laser, spot and vertex: the cameras' mean, by share of the footprint seen and view cosine."""
-        weight = np.zeros(self.value.shape[1:], np.float32)  # (S, C, V)
-        tilt = np.zeros_like(weight)
+        """One value per laser, spot and vertex: the cameras' mean by the share of the footprint seen and by precision.
+
+        Precision is that expected at the entry: noise, scatter between directions, obliqueness of the view.
+        """
+        shape = self.value.shape[1:]
+        share, oblique, tilt = (np.zeros(shape, np.float32) for _ in range(3))
         for view, reading in enumerate(self.readings):
             rows = self.plan.spots_at(self.plan.angle_of(view))
             at = np.s_[rows.start : rows.stop, self.plan.camera_of(view)]
-            weight[at] = reading.share * reading.cosine
+            share[at], oblique[at] = reading.share, oblique_variance(reading.cosine)
             at_vertices, at_spots = outward_tilt(mesh, spots, glow[view].camera.position)
             tilt[at] = (at_vertices + at_spots)[rows.start : rows.stop]
-        tilt = (weight * tilt).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-9)
-        weight = np.where(np.isfinite(self.value), weight, 0.0).astype(np.float32)
-        total = weight.sum(axis=2)
-        norm = np.where(total > 0, total, np.nan)
-        value = np.where(weight > 0, weight * self.value, 0.0).sum(axis=2) / norm
-        dark = (weight**2 * self.dark).sum(axis=2) / norm**2
-        slope = (weight**2 * self.noise_per_signal()).sum(axis=2) / norm**2
-        return Samples(mesh, eta, spots, value, dark, slope, tilt.astype(np.float64), glow)
+        slope = self.noise_per_signal()
+        distance = np.linalg.norm(spots.position[:, None] - np.asarray(mesh.vertices), axis=2)
+        expected = self.expected(distance)[:, :, None]
+        relative = (self.dark + slope * expected) / expected**2 + ANGULAR**2 + oblique
+        weight = np.where(np.isfinite(self.value), share / relative, 0.0)
+        weight /= np.maximum(weight.sum(axis=2, keepdims=True), 1e-30)
+        value = np.where(weight > 0, weight * self.value, 0.0).sum(axis=2)
+        seen = weight.sum(axis=2) > 0
+        common = weight.mean(axis=0)  # of directions, which the lasers share
+        common /= np.maximum(common.sum(axis=1, keepdims=True), 1e-30)
+        incidence = oblique_variance(-(spots.normal * spots.direction).sum(axis=1))
+        return Samples(
+            mesh,
+            eta,
+            spots,
+            np.where(seen, value, np.nan).astype(np.float32),
+            (weight**2 * self.dark).sum(axis=2).astype(np.float32),
+            (weight**2 * slope).sum(axis=2).astype(np.float32),
+            (incidence[:, None] + (common * oblique).sum(axis=1)).astype(np.float32),
+            (common * tilt).sum(axis=1).astype(np.float64),
+            glow,
+        )
 
 
 def take_samples(

@@ -49,7 +49,7 @@ def make(
     to_spots = interpolation(mesh, triangle, barycentric)
     empty = np.full((lasers, spots, len(points)), np.nan, np.float32)
     level = np.zeros((spots, len(points)))
-    bare = Samples(mesh, 1.3, where, empty, empty, empty, level)
+    bare = Samples(mesh, 1.3, where, empty, empty, empty, level.astype(np.float32), level)
     values, truths = [], []
     for laser in range(lasers):
 
@@ -67,7 +67,14 @@ def make(
         value[:, group::3, blind] = np.nan
     slope = noise**2 * np.nan_to_num(value)
     samples = Samples(
-        mesh, 1.3, where, value.astype(np.float32), np.zeros_like(value, np.float32), slope.astype(np.float32), level
+        mesh,
+        1.3,
+        where,
+        value.astype(np.float32),
+        np.zeros_like(value, np.float32),
+        slope.astype(np.float32),
+        level.astype(np.float32),
+        level,
     )
     truth = np.stack(truths)
     return Synthetic(samples, 0.5 * (truth + truth.transpose(0, 2, 1)))

@@ -128,11 +128,11 @@ def test_boundary_is_measured(captured) -> None:  # type: ignore[no-untyped-def]
     folder, mesh = captured
     samples, _ = samples_of(folder, mesh, footprint_reading)
     exact = np.stack([samples.spot_pairs.mean(lambda d, k=k: reflectance(d, k)) for k in range(2)])
-    smooth = measure_boundary(mesh, ETA, samples.glow, exact)
+    smooth = measure_boundary(mesh, ETA, samples.glow, lambda _: exact)
     assert smooth.cosines == tuple(sorted(smooth.cosines))
     steep = np.array(smooth.cosines) > 0.3
     np.testing.assert_allclose(np.array(smooth.ratio)[steep], 1.0, atol=0.05)
-    other = measure_boundary(mesh, ETA, samples.glow, exact / 1.1)
+    other = measure_boundary(mesh, ETA, samples.glow, lambda _: exact / 1.1)
     np.testing.assert_allclose(np.array(other.ratio)[steep], 1.1 * np.array(smooth.ratio)[steep], rtol=1e-6)
 
 

@@ -1,0 +1,70 @@
+"""How readings become samples: weights of the cameras, and the noise that is told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from reconstruct_capture import ETA, rig
+from scipy import sparse
+
+from hw.interface import Aim
+from hw.record import RadianceImage
+from pipeline.calibrate.camera import PinholeCamera
+from pipeline.capture.plan import ImageAddress, Plan
+from pipeline.reconstruct.samples import ANGULAR, OBLIQUE, Glow, Samples, _Gathered, noise_squared
+from pipeline.reconstruct.spots import Spots
+from pipeline.reconstruct.views import Reading
+
+
+def gathered_twice(noise_front: float, cosine_back: float, value: float = 1e-3) -> Samples:
+    """One spot seen by two cameras that disagree by a half; noise_front: relative noise of what the first one says."""
+    plan = Plan(("front", "back"), (0.0,), (Aim(0, 0, 0),), 1)
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    size = len(mesh.vertices)
+    operator = sparse.csr_array((np.ones(size), (np.arange(size), np.zeros(size, int))), shape=(size, 1))
+    readings = [Reading(operator, np.ones(size), np.full(size, cosine)) for cosine in (0.9, cosine_back)]
+    gathered = _Gathered(1, plan, readings)
+    for view, factor in enumerate((1.0, 1.5)):
+        variance = np.full((1, 1), (value * noise_front) ** 2 if view == 0 else 1e-20)
+        image = RadianceImage(np.full((1, 1), value * factor), variance, np.zeros((1, 1), bool))
+        gathered.add(ImageAddress(view, "spot", 0, 0), image, variance, 1.0)
+    up = np.array([[0.0, 0.0, 1.0]])
+    spots = Spots(up, -up, up, np.array([0]), np.full((1, 3), 1 / 3), np.ones(1), 1.0)
+    camera = PinholeCamera.from_config(rig().cameras[0])
+    glow = tuple(Glow(camera, np.zeros((1, 80, 96)), np.ones((1, 1), bool)) for _ in range(2))
+    return gathered.combined(mesh, ETA, spots, glow)
+
+
+def test_cameras_are_merged_by_expected_precision() -> None:
+    """Rationale: two readings of 1 and 1.5 weigh by one over noise^2 + scatter between directions^2 + obliqueness^2.
+    Expected behaviour: alike, they meet in the middle; noise or a grazing view of one moves the mean to the other by
+    just that much, and the variance that is told is that of the weighted mean.
+    """
+    for noise, cosine in ((0.0, 0.9), (0.3, 0.9), (0.0, 0.2), (0.3, 0.2)):
+        s = gathered_twice(noise, cosine)
+        expected = 1.25e-3  # both cameras' mean at this distance
+        front = (1e-3 * noise / expected) ** 2 + ANGULAR**2 + OBLIQUE**2 * (1 - 0.9) ** 8
+        back = ANGULAR**2 + OBLIQUE**2 * (1 - cosine) ** 8
+        share = (1 / front) / (1 / front + 1 / back)
+        np.testing.assert_allclose(s.values, 1e-3 * (share + 1.5 * (1 - share)), rtol=1e-5)
+        np.testing.assert_allclose(s.dark_variance, (share * 1e-3 * noise) ** 2, rtol=1e-4, atol=1e-19)
+
+
+def test_noise_of_dark_samples_is_told_truly() -> None:
+    """Rationale: images of nothing but noise. The stated variance is that of the samples, not a clipped-up one."""
+    plan = Plan(("front",), (0.0,), tuple(Aim(0, i, 0) for i in range(200)), 1)
+    rng, sigma = np.random.default_rng(5), 1e-3
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    size, shape = len(mesh.vertices), (40, 40)
+    pixel = rng.permutation(shape[0] * shape[1])[: 4 * size].reshape(size, 4)
+    rows = np.repeat(np.arange(size), 4)
+    operator = sparse.csr_array((np.full(4 * size, 0.25), (rows, pixel.ravel())), shape=(size, shape[0] * shape[1]))
+    gathered = _Gathered(1, plan, [Reading(operator, np.ones(size), np.ones(size))])
+    for spot in range(200):
+        radiance = 0.1 * sigma + sigma * rng.standard_normal(shape)
+        image = RadianceImage(radiance, np.full(shape, 1e-3 * sigma**2), np.zeros(shape, bool))
+        gathered.add(ImageAddress(0, "spot", spot, 0), image, noise_squared(radiance), 1.0)
+    told = gathered.noise_per_signal()[0, :, 0] * np.maximum(gathered.value[0, :, 0], 0)
+    actual = gathered.value[0, :, 0].var(axis=0).mean()
+    assert told.mean() == pytest.approx(actual, rel=0.1)
