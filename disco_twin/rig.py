@@ -17,16 +17,18 @@ from numpy.typing import NDArray
 from disco_twin.camera.lars3 import Lars3
 from disco_twin.deviation import ActualRig, actual_rig
 from disco_twin.faults import LaserPower, Stream, generator, speckle
+from hw.devices.mm_ard import ADC_TOP
 from hw.errors import DiscoError, InputError, Refused
 from hw.interface import Aim, Camera, Floodlight, Laser, Photodiode, Projector, Turntable
 from hw.record import RawImage
-from pipeline.rig import RigConfig
+from pipeline.rig import LaserConfig, RigConfig
 
 F32 = NDArray[np.float32]
 
 FRAMES_PER_IMAGE = 2  # every other frame is discarded while the mirrors move (thesis 4.1)
 TURN_S = 8.0  # turning to another angle and coming to rest
 PHOTODIODE_NOISE = 1e-3  # of the reading, standard deviation
+PHOTODIODE_RANGE = 2.0  # top of its converter, in the laser's nominal power
 
 
 class ResponseSource(Protocol):
@@ -53,13 +55,24 @@ class _Scene:
     flood: bool = False
 
 
+class Power(Protocol):
+    """What the lasers give."""
+
+    def watts(self, laser: int, time_s: float) -> float: ...
+
+
+def watts_per_count(laser: LaserConfig) -> float:
+    """Of the photodiode's 10-bit converter (the MM-Ard board's), whose gain is set for each laser."""
+    return PHOTODIODE_RANGE * laser.power_mw * 1e-3 / ADC_TOP
+
+
 class TwinRig:
     """`hw.interface.Rig` without hardware: nominal `config`, light from `source`, everything random from `seed`."""
 
     def __init__(self, config: RigConfig, source: ResponseSource, seed: int, actual: ActualRig | None = None) -> None:
         actual = actual_rig(config, seed) if actual is None else actual
         self.config, self.source, self.seed = config, source, seed
-        self.power = LaserPower(config.lasers, config.faults, seed)
+        self.power: Power = LaserPower(config.lasers, config.faults, seed)
         self.lasers: Sequence[Laser] = [TwinLaser(self, i) for i in range(len(config.lasers))]
         self.projector: Projector = TwinProjector(self)
         self.turntable: Turntable = TwinTurntable(self)
@@ -71,11 +84,12 @@ class TwinRig:
         self.powered = False
         self.clock = 0.0
         self.scene = self._home = _Scene(0, config.projector.steps // 2, config.projector.steps // 2)
-        self.reading = 0.0
+        self.counts, self.reading = 0, 0.0
         self._exposed: dict[int, tuple[_Scene, int]] = {}  # camera -> its last scene and how often it saw it before
 
     def __enter__(self) -> Self:
-        self.powered, self.clock, self.reading, self.scene = True, 0.0, 0.0, self._home
+        self.powered, self.clock, self.scene = True, 0.0, self._home
+        self.counts, self.reading = 0, 0.0
         self._exposed.clear()
         return self
 
@@ -230,7 +244,9 @@ class TwinCamera:
             max(scene.gate, 0),
             generator(rig.seed, Stream.SENSOR, *address, repeats),
         )
-        rig.reading = watts * (1.0 + PHOTODIODE_NOISE * float(noise))
+        scale = watts_per_count(rig.config.lasers[max(scene.gate, 0)])
+        rig.counts = min(max(round(watts * (1.0 + PHOTODIODE_NOISE * float(noise)) / scale), 0), ADC_TOP)
+        rig.reading = rig.counts * scale
         rig.clock += FRAMES_PER_IMAGE * frame
         return raw
 
@@ -253,7 +269,7 @@ class TwinCamera:
 
 @dataclass
 class TwinPhotodiode:
-    """Reads the open laser's mean power over the last exposure, with noise."""
+    """Reads the open laser's mean power over the last exposure, with noise and in the steps of its converter."""
 
     rig: TwinRig
 

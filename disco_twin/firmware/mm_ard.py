@@ -35,9 +35,10 @@ class Galvo:
 
 @dataclass
 class MirrorHead:
-    """What the board drives. `sample(pin)` is what the converter sees, 0 .. 1023."""
+    """What the board drives. `sample(pin)` is what the converter sees, 0 .. 1023; `on_move` hears of mirror moves."""
 
     sample: Callable[[int], int] = lambda pin: 0
+    on_move: Callable[[], None] = lambda: None
     channels: int = 2
     galvos: tuple[Galvo, Galvo] = field(default_factory=lambda: (Galvo(), Galvo()))
     lines: int = 0
@@ -51,6 +52,7 @@ class MirrorHead:
     def write(self, channel: int, value: int, now: float) -> None:
         """To the DAC: channel 0 is A, any other B. Without a DAC nothing happens."""
         if self.channels >= 2:
+            self.on_move()
             self.galvos[0 if channel == 0 else 1].aim(value, now)
 
     def set_pattern(self, pattern: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 SPEED_DEG_S = 45.0
@@ -12,13 +13,15 @@ SETTLE_S = 0.3
 class Spindle:
     """Turns at a constant speed, then settles. Angles in degrees, unbounded; `homed` after finding its zero.
 
-    `sticks_at_deg`: the next move that comes by stalls there. After a power cut the stage does not know where it is.
+    `sticks_at_deg`: the next move that comes by stalls there. `on_move` hears of every angle that it is sent to.
+    After a power cut the stage does not know where it is.
     """
 
     angle_deg: float = 0.0
     homed: bool = False
     stalled: bool = False
     sticks_at_deg: float | None = None
+    on_move: Callable[[float], None] = lambda angle_deg: None
     _since: float = 0.0
     _busy_until: float = 0.0
     _homing: bool = False
@@ -48,6 +51,7 @@ class Spindle:
         self.angle_deg, self._homing = angle_deg, homing and not self.stalled
         duration = abs(angle_deg - self._start) / SPEED_DEG_S + SETTLE_S
         self._busy_until = now + duration
+        self.on_move(angle_deg)
         return duration
 
     def stop(self, now: float) -> None:

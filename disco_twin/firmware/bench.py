@@ -1,0 +1,144 @@
+"""The bench that emulated devices stand on: their states move the twin's, and the twin's cameras see it.
+
+DAC values aim the simulated beam, emission and gate light it, the turntable turns the object. Two clocks: the twin's is
+the record's (fixed amounts for frames and turns, as in the direct twin); the link's passes with every byte, wait and
+move. Serial traffic of an image fits into the frame that is discarded anyway, and a turn into the twin's time for one:
+`docs/decisions/0030-two-clocks.md`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from disco_twin.firmware.mm_ard import MirrorHead
+from disco_twin.firmware.omicron import LaserHead
+from disco_twin.firmware.turning import Spindle
+from disco_twin.rig import FRAMES_PER_IMAGE, TURN_S, Power, TwinRig
+from hw.clock import Clock
+from hw.devices.mm_ard import LINES, STEPS
+from hw.errors import DiscoError, InputError
+from hw.interface import Camera
+from hw.record import RawImage
+
+FLOOD_LINE = LINES - 1  # the lasers' gates are lines 0, 1, 2
+AT_ANGLE_DEG = 0.01  # the object stands at a configured angle if it is as close as this
+
+
+@dataclass
+class EmittedPower:
+    """The twin's laser power times what its emulated head is set to."""
+
+    twin: Power
+    share: Callable[[int], float]
+
+    def watts(self, laser: int, time_s: float) -> float:
+        """Power on the object in watts."""
+        return self.twin.watts(laser, time_s) * self.share(laser)
+
+
+class Bench:
+    """A twin whose lasers, mirrors, gates, photodiode and turntable are emulated devices.
+
+    `hazards` lists what must never happen: light that moves, or two lasers at once.
+    """
+
+    def __init__(self, twin: TwinRig, clock: Clock) -> None:
+        config = twin.config
+        if config.projector.steps > STEPS:
+            raise InputError(
+                "more mirror steps than the emulated board's DAC has",
+                key="rig.projector.steps",
+                value=config.projector.steps,
+                allowed=f"at most {STEPS}",
+            )
+        self.twin, self.clock = twin, clock
+        self.heads = [LaserHead(laser.wavelength_nm, laser.power_mw) for laser in config.lasers]
+        self.board = MirrorHead(sample=self._counts, on_move=lambda: self._require_dark("the mirrors"))
+        self.spindle = Spindle(on_move=self.turned)
+        self.cameras: list[Camera] = [BenchCamera(self, camera) for camera in twin.cameras]
+        self.hazards: list[str] = []
+        twin.power = EmittedPower(twin.power, self._share)
+
+    # ---- the timebase of the record (hw.rig.Timebase)
+
+    def restart(self) -> None:
+        """The rig is ready: the twin starts at time 0."""
+        self.twin.__enter__()
+
+    def now(self) -> float:
+        """The twin's clock."""
+        return self.twin.now()
+
+    def resume_at(self, time_s: float) -> None:
+        """Continue an interrupted capture."""
+        self.twin.resume_at(time_s)
+
+    # ---- what the devices do to the twin
+
+    def _share(self, laser: int) -> float:
+        """Of the nominal power, that leaves the head now."""
+        head = self.heads[laser]
+        return head.emission(self.clock.now()) * (head.max_power_mw / self.twin.config.lasers[laser].power_mw)
+
+    def light(self) -> list[int]:
+        """The lasers whose light falls on the object now."""
+        return [i for i in range(len(self.heads)) if self.board.lines >> i & 1 and self._share(i) > 0.0]
+
+    def _require_dark(self, what: str) -> None:
+        if self.light():
+            self.hazards.append(f"{what} moved in the light of laser {self.light()}")
+
+    def turned(self, angle_deg: float) -> None:
+        """The turntable has been sent to an angle; the twin's clock is charged for a turn to another one."""
+        self._require_dark("the turntable")
+        angles = np.asarray(self.twin.config.turntable_angles_deg)
+        away = np.abs(np.remainder(angle_deg - angles + 180.0, 360.0) - 180.0)
+        nearest = int(np.argmin(away))
+        if away[nearest] < AT_ANGLE_DEG and nearest != self.twin.scene.angle:
+            self.twin.clock += TURN_S
+            self.twin.alter(angle=nearest)
+
+    def _counts(self, pin: int) -> int:
+        """The converter holds the mean over the last exposure while its laser is lit."""
+        return self.twin.counts if self.light() == [pin] else 0
+
+    def look(self) -> None:
+        """Put the twin into the state that the devices are in."""
+        now, light = self.clock.now(), self.light()
+        if len(light) > 1:
+            self.hazards.append(f"lasers {light} at once")
+            raise DiscoError(f"the simulated camera sees lasers {light} at once")
+        if not self.board.settled(now):
+            raise DiscoError("the simulated camera sees the mirrors moving")
+        angle = self.twin.config.turntable_angles_deg[self.twin.scene.angle]
+        away = abs((self.spindle.position(now) - angle + 180.0) % 360.0 - 180.0)
+        if away >= AT_ANGLE_DEG or self.spindle.busy(now):
+            raise DiscoError(f"the twin has no light for a turntable at {self.spindle.position(now):.2f} deg")
+        u, v = (int(galvo.position(now)) for galvo in self.board.galvos)
+        flood = bool(self.board.lines >> FLOOD_LINE & 1)
+        self.twin.alter(steps=(u, v), gate=light[0] if light else -1, flood=flood)
+
+
+@dataclass
+class BenchCamera:
+    """A simulated camera in front of emulated devices: one discarded frame, one that counts."""
+
+    bench: Bench
+    twin: Camera
+
+    @property
+    def name(self) -> str:
+        """The name in the configuration."""
+        return self.twin.name
+
+    def expose(self) -> RawImage:
+        """What the twin's camera sees of the bench."""
+        frame = self.bench.twin.config.sensor.longest_exposure_s
+        self.bench.clock.sleep((FRAMES_PER_IMAGE - 1) * frame)
+        self.bench.look()
+        raw = self.twin.expose()
+        self.bench.clock.sleep(frame)
+        return raw

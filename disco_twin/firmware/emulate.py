@@ -1,0 +1,78 @@
+"""A whole emulated rig: devices on a bench, each on a line of its own, and `hw.rig.SerialRig` connected to them."""
+
+from __future__ import annotations
+
+import itertools
+from contextlib import ExitStack
+from pathlib import Path
+
+from disco_twin.firmware.bench import FLOOD_LINE, Bench
+from disco_twin.firmware.mm_ard import MmArdFirmware
+from disco_twin.firmware.omicron import OmicronFirmware
+from disco_twin.firmware.wire import Line
+from disco_twin.firmware.zaber import MICROSTEPS_PER_DEG, ZaberFirmware
+from disco_twin.rig import TURN_S, TwinRig, watts_per_count
+from hw.bytelog import ByteLog
+from hw.clock import Clock, VirtualClock
+from hw.devices.mm_ard import MirrorBoard
+from hw.devices.omicron import OmicronLaser
+from hw.devices.zaber import ZaberTable
+from hw.ports.protocol_memory import attach
+from hw.rig import Devices, LaserWiring, SerialRig
+from hw.serial_link import Link
+
+_NUMBERS = itertools.count()
+
+
+class Emulation:
+    """The devices of a twin as firmware on lines. `lines` by name: laser0 .., board, turntable."""
+
+    def __init__(self, twin: TwinRig, clock: Clock | None = None) -> None:
+        self.clock: Clock = VirtualClock() if clock is None else clock
+        self.bench = Bench(twin, self.clock)
+        self.lines = {f"laser{i}": Line(OmicronFirmware(head), self.clock) for i, head in enumerate(self.bench.heads)}
+        self.lines["board"] = Line(MmArdFirmware(self.bench.board), self.clock)
+        self.lines["turntable"] = Line(ZaberFirmware(self.bench.spindle), self.clock)
+
+    def wiring(self) -> list[LaserWiring]:
+        """What is plugged in where."""
+        lasers = self.bench.twin.config.lasers
+        return [LaserWiring(la.wavelength_nm, la.power_mw, i, i, watts_per_count(la)) for i, la in enumerate(lasers)]
+
+    def serial_rig(self, logs: Path | None = None) -> SerialRig:
+        """The rig, reached through memory ports. `logs`: a folder for the byte logs."""
+        number = next(_NUMBERS)
+        urls = {name: attach(f"emulated-{number}-{name}", line) for name, line in self.lines.items()}
+
+        def link(name: str, device: str) -> Link:
+            log = None if logs is None else ByteLog(logs / f"{name}.log")
+            return Link(urls[name], self.lines[name].firmware.baud, device, self.clock, log)
+
+        def connect() -> Devices:
+            with ExitStack() as opened:
+                heads = []
+                for i, wiring in enumerate(self.wiring()):
+                    wavelength = wiring.wavelength_nm
+                    port = link(f"laser{i}", f"laser {wavelength:g} nm")
+                    opened.callback(port.close)
+                    heads.append(OmicronLaser(port, wavelength))
+                port = link("board", "mirror board")
+                opened.callback(port.close)
+                board = MirrorBoard(port)
+                port = link("turntable", "turntable")
+                opened.callback(port.close)
+                table = ZaberTable(port, MICROSTEPS_PER_DEG, reach_s=TURN_S)
+                opened.pop_all()
+            return Devices(heads, board, table)
+
+        steps = self.bench.twin.config.projector.steps
+        return SerialRig(
+            connect,
+            self.wiring(),
+            self.bench.cameras,
+            self.clock,
+            flood_line=FLOOD_LINE,
+            timebase=self.bench,
+            announce=self.bench.twin.announce,
+            centre=(steps // 2, steps // 2),
+        )
