@@ -26,10 +26,17 @@ $(READY): pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
 	@touch $@
 
+# Other people's programs, for outside checks; where one cannot be had, its test is skipped.
+CLIENTS := $(VENV)/.clients
+$(CLIENTS): $(READY)
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[clients]'
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[luxx]'
+	@touch $@
+
 demo: $(READY)
 	$(BIN)/disco-twin run scenes/quick.toml --out $(OUT)
 
-test: $(READY)
+test: $(CLIENTS)
 	$(BIN)/python -m pytest
 
 lint: $(READY)
@@ -37,7 +44,7 @@ lint: $(READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-validate: $(READY)
+validate: $(CLIENTS)
 	$(BIN)/python -m pytest -m "slow or not slow" --timeout 1800
 
 # After a change of the quick scene's object, lights or held-out views, and then commit them.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -39,14 +40,18 @@ class Emulation:
         lasers = self.bench.twin.config.lasers
         return [LaserWiring(la.wavelength_nm, la.power_mw, i, i, watts_per_count(la)) for i, la in enumerate(lasers)]
 
-    def serial_rig(self, logs: Path | None = None) -> SerialRig:
-        """The rig, reached through memory ports. `logs`: a folder for the byte logs."""
+    def attach(self) -> dict[str, str]:
+        """Make every line a memory port; URLs by name."""
         number = next(_NUMBERS)
-        urls = {name: attach(f"emulated-{number}-{name}", line) for name, line in self.lines.items()}
+        return {name: attach(f"emulated-{number}-{name}", line) for name, line in self.lines.items()}
+
+    def serial_rig(self, logs: Path | None = None, urls: Mapping[str, str] | None = None) -> SerialRig:
+        """The rig, reached through `urls` (memory ports if None). `logs`: a folder for the byte logs."""
+        ports = self.attach() if urls is None else urls
 
         def link(name: str, device: str) -> Link:
             log = None if logs is None else ByteLog(logs / f"{name}.log")
-            return Link(urls[name], self.lines[name].firmware.baud, device, self.clock, log)
+            return Link(ports[name], self.lines[name].firmware.baud, device, self.clock, log)
 
         def connect() -> Devices:
             with ExitStack() as opened:

@@ -6,6 +6,7 @@ would deliver them, and implements `hw.ports.protocol_memory.Peer`, so that driv
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections import deque
 from collections.abc import Callable
@@ -83,16 +84,16 @@ class Line:
         self.answer_faults: deque[Fault | None] = deque()
         self.command_faults: deque[Callable[[bytes], bytes] | None] = deque()
         self.plugged = True
-        self._open = False
-        self._free = -math.inf  # when the line has delivered everything
-        self._arriving: deque[Timed] = deque()  # absolute times
+        self._users = 0  # an old handle may be closed after a new one was opened
+        self._coming: list[Timed] = []  # by the time at which the device begins to send them
+        self._free = self._held_until = -math.inf
         self._arrived = bytearray()
 
     # ---- what a test or a user does to it
 
     def unplug(self) -> None:
         """Pull the cable: the port is dead until it is plugged in and opened again."""
-        self.plugged = self._open = False
+        self.plugged, self._users = False, 0
         self._forget()
 
     def plug(self) -> None:
@@ -109,9 +110,9 @@ class Line:
         self._send([(0.0, data)])
 
     def _forget(self) -> None:
-        self._arriving.clear()
+        self._coming.clear()
         self._arrived.clear()
-        self._free = -math.inf
+        self._free = self._held_until = -math.inf
 
     # ---- the computer's side
 
@@ -119,16 +120,16 @@ class Line:
         """The port was opened."""
         if not self.plugged:
             raise OSError(2, "no such port: the device is unplugged")
-        self._open = True
+        self._users += 1
         self._forget()
         self.firmware.opened(self.clock.now())
 
     def closed(self) -> None:
         """The port was closed; the device goes on."""
-        self._open = False
+        self._users = max(0, self._users - 1)
 
     def _require_cable(self) -> None:
-        if not self._open:
+        if not self._users:
             raise OSError(5, "input/output error: the device is unplugged")
 
     def receive(self, data: bytes) -> None:
@@ -144,21 +145,27 @@ class Line:
         for delay, data in answers:
             fault = self.answer_faults.popleft() if self.answer_faults else None
             for more, piece in [(0.0, data)] if fault is None else fault(data):
-                self._free = max(self._free, now + delay + more) + self._duration(piece)
-                self._arriving.append((self._free, piece))
+                start = max(now + delay + more, self._held_until)
+                if more > 0.0:  # what is late keeps its place in the order
+                    self._held_until = start
+                bisect.insort(self._coming, (start, piece), key=lambda timed: timed[0])
 
     def _duration(self, data: bytes) -> float:
         return len(data) * BITS_PER_BYTE / self.firmware.baud
 
     def next_arrival(self) -> float:
-        """When the next bytes arrive; infinity if none are on their way."""
-        return self._arriving[0][0] if self._arriving else math.inf
+        """When the next bytes will have arrived; infinity if none are on their way."""
+        if not self._coming:
+            return math.inf
+        start, piece = self._coming[0]
+        return max(start, self._free) + self._duration(piece)
 
     def waiting(self) -> int:
         """Bytes that have arrived."""
         self._require_cable()
-        while self._arriving and self._arriving[0][0] <= self.clock.now():
-            self._arrived += self._arriving.popleft()[1]
+        while (arrival := self.next_arrival()) <= self.clock.now():
+            self._free = arrival
+            self._arrived += self._coming.pop(0)[1]
         return len(self._arrived)
 
     def deliver(self, size: int, timeout_s: float) -> bytes:

@@ -138,7 +138,8 @@ class ZaberFirmware:
             case ["warnings", *clear] if clear in ([], ["clear"]):
                 flags = [flag for flag in self.warnings(now) if flag != "--"]
                 if clear:
-                    self.interrupted = self.spindle.stalled = False
+                    self.interrupted = False
+                    self.spindle.stalled &= self.spindle.busy(now)  # what is still to come is not cleared
                 return True, " ".join([f"{len(flags):02d}", *flags])
             case _:
                 return False, "BADCOMMAND"

@@ -1,7 +1,8 @@
 """Thorlabs Elliptec rotation stages (ELL14): 9600 baud, one hex digit of address and two letters a command.
 
 The answer to a move comes when the motion has ended; `GS` with a code comes instead of it when something is wrong.
-Answers have no number of ours and no checksum, so that after a lost one the line must fall silent first.
+Answers have no number of ours and no checksum, so that after a lost one the stage is asked who it is: what comes before
+that answer is old.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ BAUD = 9600
 ANSWER_S = 0.5
 HOME_S = 20.0
 QUIET_S = 0.3
+RESYNC_S = 3.0
 ROTARY = {0x0E: "ELL14", 0x12: "ELL18"}
 OK, BUSY = 0, 9
 CODES = {
@@ -69,6 +71,7 @@ class ElliptecTable:
     def __init__(self, link: Link, address: int = 0, reach_s: float = 20.0) -> None:
         self.link, self.reach_s = link, reach_s
         self._address = f"{address:X}"
+        self._owed = False  # an answer that was not waited for may still come
         self._inbox: Inbox[str] = Inbox(link, ElliptecFramer())
         self.model, self.serial_number, self._pulses = self._identify()
 
@@ -77,10 +80,13 @@ class ElliptecTable:
     def _once(self, command: str, expected: str, timeout_s: float) -> str:
         """The data of the next `expected` answer or of a `GS`, which begins with its letters."""
         a = self._address
+        if self._owed:
+            self._resynchronise()
         self._inbox.clear()
         self.link.write((a + command).encode("ascii"))
         wanted = {a + expected, a + "GS"}
         line = self._inbox.next(lambda m: m[:3] in wanted, timeout_s)
+        self._owed = line is None
         if line is None:
             problem = f"did not answer {a + command!r} within {timeout_s:g} s"
             raise NoAnswer(self.link.url, self.link.device, problem, "check cable and power of the turntable")
@@ -98,8 +104,10 @@ class ElliptecTable:
         return persist(attempt, self._resynchronise)
 
     def _resynchronise(self) -> None:
-        """Wait until nothing more comes."""
+        """Answers come in order: once the stage has said who it is, no older answer can come any more."""
         self._inbox.drain(QUIET_S)
+        self.link.write((self._address + "in").encode("ascii"))
+        self._owed = self._inbox.next(lambda m: m[:3] == self._address + "IN", RESYNC_S) is None
 
     # ---- identity
 
@@ -142,8 +150,7 @@ class ElliptecTable:
         except NoAnswer:
             while (code := self._ask("gs", "GS", _code)) == BUSY:
                 if clock.now() > end:
-                    where = f"it stands at {np.rad2deg(self.angle_rad()):.1f} deg"
-                    raise not_reached(self.link, angle_deg, limit_s, where) from None
+                    raise not_reached(self.link, angle_deg, limit_s, "it is still turning") from None
                 clock.sleep(POLL_S)
             self._check(f"GS{code:02X}")
         tolerance = max(2, round(self._pulses / 3600))  # 0.1 deg: what the stage repeats to

@@ -18,6 +18,8 @@ STEPS = 4096  # of the 12-bit DAC
 ADC_TOP = 1023
 LINES = 6
 PINS = 6
+ATTEMPTS = 3
+RESTART = bytes(3)  # ends whatever command is unfinished
 IDENTITY = b"MM-Ard\r\n"
 
 SET_LINES, GET_LINES, SET_DAC, NO_BLANKING, IDENTIFY, VERSION, CHANNELS, READ_PIN = 1, 2, 3, 21, 30, 31, 34, 41
@@ -126,44 +128,44 @@ class MirrorBoard:
             self._exchange(command, command)
 
     def set_lines(self, pattern: int) -> None:
-        """The TTL lines as bits 0 .. 5; read back, since the echo does not contain them."""
+        """The TTL lines as bits 0 .. 5; read back, since the echo does not contain them.
+
+        Understood wherever in a command the board's parser is: the longest command takes three arguments, so three
+        zeros end any unfinished one (with harmless values), and otherwise they are ignored.
+        """
         if not 0 <= pattern < 1 << LINES:
             raise InputError("no such pattern of TTL lines", value=pattern, allowed=f"0 to {(1 << LINES) - 1}")
-        if not pattern:
+        for _ in range(ATTEMPTS):
+            self._exchange(bytes([*RESTART, SET_LINES, pattern]), bytes([SET_LINES]))
+            found = self.lines()
+            if found == pattern:
+                return
+        if pattern:
             self.shut()
-            return
-        self._exchange(bytes([SET_LINES, pattern]), bytes([SET_LINES]))
-        self._require(pattern)
+        problem = f"has its TTL lines at {found:06b} instead of {pattern:06b}"
+        remedy = "switch the board off and on; blanking and trigger modes must be off"
+        raise DeviceRefused(self.link.url, self.link.device, problem, remedy)
 
     def shut(self) -> None:
-        """Every line low, wherever in a command the board's parser is.
-
-        The longest command takes three arguments: three zeros end any unfinished one (with a harmless value) and are
-        ignored otherwise, so that `1 0` is understood in any case.
-        """
-        self._exchange(bytes([0, 0, 0, SET_LINES, 0]), bytes([SET_LINES]))
-        self._require(0)
+        """Every line low."""
+        self.set_lines(0)
 
     def lines(self) -> int:
         """The TTL lines as they are."""
         return self._exchange(bytes([GET_LINES]), bytes([GET_LINES]), 1)[0] & (1 << LINES) - 1
 
     def counts(self, pin: int) -> int:
-        """The 10-bit ADC's value at an analogue pin."""
+        """The 10-bit ADC's value at an analogue pin: the median of three readings.
+
+        The protocol has no checksum: one garbled reading could not be told from a right one.
+        """
         if not 0 <= pin < PINS:
             raise InputError("no such analogue pin", value=pin, allowed=f"0 to {PINS - 1}")
-        high, low = self._exchange(bytes([READ_PIN, pin]), bytes([READ_PIN, pin]), 2)
-        if high > ADC_TOP >> 8:
-            problem = f"read {high << 8 | low} at pin {pin} of a 10-bit converter"
-            raise Garbled(self.link.url, self.link.device, problem, "check cable and grounding of the board")
-        return high << 8 | low
+        return sorted(self._sample(pin) for _ in range(3))[1]
 
-    def _require(self, pattern: int) -> None:
-        found = self.lines()
-        if found != pattern:
-            problem = f"has its TTL lines at {found:06b} instead of {pattern:06b}"
-            remedy = "switch the board off and on; blanking and trigger modes must be off"
-            raise DeviceRefused(self.link.url, self.link.device, problem, remedy)
+    def _sample(self, pin: int) -> int:
+        high, low = self._exchange(bytes([READ_PIN, pin]), bytes([READ_PIN, pin]), 2)
+        return min(high << 8 | low, ADC_TOP)
 
     def close(self) -> None:
         """Shut every line as far as the board still listens, and give the port back."""

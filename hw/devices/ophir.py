@@ -1,7 +1,7 @@
 """Ophir power meters (Vega, Nova II) over RS-232, 9600 baud: `$..` CR LF is answered by `*...` or `?...`, CR LF.
 
-Answers have neither number nor checksum: after a lost one the line must fall silent before the next question, and a
-reading must look like a power.
+Answers have neither number nor checksum: after a lost one the meter is asked who it is, and what comes before that
+answer is old.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ T = TypeVar("T")
 BAUD = 9600
 ANSWER_S = 1.0
 QUIET_S = 0.5
+RESYNC_S = 3.0
 METERS = ("VEGA", "NOVAII", "NOVA2", "LASERSTAR")
 POWER = re.compile(r"-?\d+(\.\d+)?(E[+-]?\d+)?")
 
@@ -36,14 +37,24 @@ class OphirMeter:
     def _once(self, command: str) -> str:
         self._inbox.clear()
         self.link.write(f"${command}\r\n".encode("ascii"))
-        line = self._inbox.next(lambda m: m[:1] in "*?", ANSWER_S)
+        identity = command in ("II", "HI")
+        line = self._inbox.next(lambda m: m[:1] in "*?" and (identity or not self._is_identity(m)), ANSWER_S)
         if line is None:
             problem = f"did not answer ${command} within {ANSWER_S:g} s"
             raise NoAnswer(self.link.url, self.link.device, problem, "check cable, power and baud rate of the meter")
-        if line.startswith("?"):
+        if line.startswith("?") and not POWER.fullmatch(line[1:].strip()):
             problem = f"refused ${command} ({line[1:].strip()})"
             raise DeviceRefused(self.link.url, self.link.device, problem, "check that a sensor head is plugged in")
-        return line[1:].strip()
+        return line[1:].strip() if line.startswith("*") else line
+
+    def _is_identity(self, line: str) -> bool:
+        return line[1:].strip().upper().startswith(METERS)
+
+    def _resynchronise(self) -> None:
+        """Answers come in order: once the meter has said who it is, no older answer can come any more."""
+        self._inbox.drain(QUIET_S)
+        self.link.write(b"$II\r\n")
+        self._inbox.next(self._is_identity, RESYNC_S)
 
     def _ask(self, command: str, parse: Callable[[str], T]) -> T:
         def attempt() -> T:
@@ -54,7 +65,7 @@ class OphirMeter:
                 problem = f"answered ${command} with {answer[:40]!r}, which makes no sense"
                 raise Garbled(self.link.url, self.link.device, problem, "check cable and baud rate") from error
 
-        return persist(attempt, lambda: (self._inbox.drain(QUIET_S), None)[1])
+        return persist(attempt, self._resynchronise)
 
     def _identify(self) -> str:
         try:

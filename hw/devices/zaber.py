@@ -145,6 +145,8 @@ class ZaberTable:
         return persist(attempt, self._inbox.clear)
 
     def _refused(self, command: str, reply: Reply) -> DeviceRefused | DeviceFault:
+        if reply.warning in FAULTS:
+            return DeviceFault(self.link.url, self.link.device, *FAULTS[reply.warning])
         if reply.warning in LOST:
             problem = f"does not know where it stands ({reply.warning}) and refused {command!r}"
             return DeviceFault(self.link.url, self.link.device, problem, "its power was cut or it is new: home it")
@@ -206,11 +208,8 @@ class ZaberTable:
                 where = f"it stands at {np.rad2deg(self.angle_rad()):.1f} deg"
                 raise not_reached(self.link, angle_deg, limit_s, where)
             clock.sleep(POLL_S)
-        fault = FAULTS.get(reply.warning)
-        if fault:
+        if reply.warning in FAULTS.keys() | LOST:
             self.ask("warnings clear")
-            raise DeviceFault(self.link.url, self.link.device, *fault)
-        if reply.warning in LOST:
             raise self._refused(f"go to {angle_deg:.1f} deg", reply)
 
     def angle_rad(self) -> float:

@@ -72,10 +72,19 @@ class Serial(SerialBase):
             raise PortNotOpenError
         return self._peer
 
+    def _failed(self, error: OSError) -> SerialException:
+        """A port that has failed once stays dead until it is opened again."""
+        self._peer, self.is_open = None, False
+        return SerialException(str(error))
+
     @property
     def in_waiting(self) -> int:
         """Bytes that can be read without waiting."""
-        return self._open_peer().waiting()
+        peer = self._open_peer()
+        try:
+            return peer.waiting()
+        except OSError as error:
+            raise self._failed(error) from error
 
     def read(self, size: int = 1, /) -> bytes:
         """At most `size` bytes within the port's timeout."""
@@ -83,7 +92,7 @@ class Serial(SerialBase):
         try:
             return peer.deliver(size, self.timeout or 0.0)
         except OSError as error:
-            raise SerialException(str(error)) from error
+            raise self._failed(error) from error
 
     def write(self, data: bytes, /) -> int:  # type: ignore[override]
         """Hand over all bytes."""
@@ -91,7 +100,7 @@ class Serial(SerialBase):
         try:
             peer.receive(bytes(data))
         except OSError as error:
-            raise SerialException(str(error)) from error
+            raise self._failed(error) from error
         return len(data)
 
     def reset_input_buffer(self) -> None:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from disco_twin.firmware.elliptec import ElliptecFirmware
 from disco_twin.firmware.mm_ard import MirrorHead, MmArdFirmware
 from disco_twin.firmware.omicron import LaserHead, OmicronFirmware
+from disco_twin.firmware.ophir import OphirFirmware
 from disco_twin.firmware.turning import Spindle
 from disco_twin.firmware.wire import Firmware, Line
 from disco_twin.firmware.zaber import MICROSTEPS_PER_DEG, ZaberFirmware
 from hw.bytelog import ByteLog
 from hw.clock import VirtualClock
+from hw.devices.elliptec import ElliptecTable
 from hw.devices.mm_ard import MirrorBoard
 from hw.devices.omicron import OmicronLaser
+from hw.devices.ophir import OphirMeter
 from hw.devices.zaber import ZaberTable
 from hw.ports.protocol_memory import attach
 from hw.serial_link import Link
@@ -76,3 +81,42 @@ class TableBench(Bus):
 
     def connect(self, reach_s: float = 20.0) -> ZaberTable:
         return ZaberTable(self.link("turntable"), MICROSTEPS_PER_DEG, reach_s)
+
+
+@dataclass
+class ElliptecBench(Bus):
+    firmware: Firmware = None  # type: ignore[assignment]
+    spindle: Spindle = field(default_factory=lambda: Spindle(angle_deg=30.0))
+
+    def __post_init__(self) -> None:
+        self.firmware = ElliptecFirmware(self.spindle)
+        super().__post_init__()
+
+    def connect(self, reach_s: float = 20.0) -> ElliptecTable:
+        return ElliptecTable(self.link("turntable"), reach_s=reach_s)
+
+
+@dataclass
+class MeterBench(Bus):
+    firmware: Firmware = None  # type: ignore[assignment]
+    watts: float = 1.23e-3
+
+    def __post_init__(self) -> None:
+        self.firmware = OphirFirmware(lambda: self.watts)
+        super().__post_init__()
+
+    def connect(self) -> OphirMeter:
+        return OphirMeter(self.link("power meter"))
+
+
+class ScaledClock:
+    """Real time, many times faster: for devices behind terminals and sockets."""
+
+    def __init__(self, factor: float = 5.0) -> None:
+        self._factor, self._start = factor, time.monotonic()
+
+    def now(self) -> float:
+        return (time.monotonic() - self._start) * self._factor
+
+    def sleep(self, seconds: float) -> None:
+        time.sleep(max(0.0, seconds) / self._factor)

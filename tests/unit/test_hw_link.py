@@ -44,6 +44,7 @@ def test_unplugging_is_noticed_by_reading_and_by_writing() -> None:
         with pytest.raises(Unplugged, match="unplugged"):
             bench.link("laser")
         bench.line.plug()
+        bench.link("laser")
         with pytest.raises(Unplugged):  # an old handle stays dead
             use(link)
         link.close()

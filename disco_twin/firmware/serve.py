@@ -1,0 +1,186 @@
+"""Emulated devices for other programs: on pseudo-terminals (the default) or TCP, served by one thread, in real time.
+
+A pseudo-terminal knows no baud rate, so the line adds the delay, and it does not say when it is opened: unlike a real
+board, an emulated one is not reset by that. On TCP a connection is an opening.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import pty
+import selectors
+import socket
+import threading
+import tty
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Protocol, Self
+
+from disco_twin.firmware.wire import Line
+
+log = logging.getLogger(__name__)
+
+POLL_S, IDLE_S = 0.001, 0.02  # while an answer is on its way, and otherwise
+
+
+class Port(Protocol):
+    """A line's outlet. `fd` is what is read and written, -1 while nobody is connected."""
+
+    url: str
+    fd: int
+
+    def register(self, selector: selectors.BaseSelector) -> None: ...
+    def ready(self, fd: int, selector: selectors.BaseSelector) -> None: ...
+    def close(self) -> None: ...
+
+
+class PtyPort:
+    """A pseudo-terminal with a name of its own: a link in a folder."""
+
+    def __init__(self, line: Line, link: Path) -> None:
+        self.line, self.link = line, link
+        self.fd, self._slave = pty.openpty()  # the slave stays open: without it the master fails between two users
+        tty.setraw(self._slave)
+        os.set_blocking(self.fd, False)
+        link.unlink(missing_ok=True)
+        link.symlink_to(os.ttyname(self._slave))
+        self.url = str(link)
+        line.opened()
+
+    def register(self, selector: selectors.BaseSelector) -> None:
+        """Watch it."""
+        selector.register(self.fd, selectors.EVENT_READ, self)
+
+    def ready(self, fd: int, selector: selectors.BaseSelector) -> None:
+        """Bytes from the user."""
+        self.line.receive(os.read(self.fd, 4096))
+
+    def close(self) -> None:
+        """Unplug: the user's reads and writes fail from now on."""
+        for fd in (self.fd, self._slave):
+            os.close(fd)
+        self.fd = -1
+        self.link.unlink(missing_ok=True)
+
+
+class TcpPort:
+    """A port of 127.0.0.1; one user at a time."""
+
+    def __init__(self, line: Line) -> None:
+        self.line = line
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self._user: socket.socket | None = None
+        self.fd = -1
+        self.url = f"socket://127.0.0.1:{self._server.getsockname()[1]}"
+
+    def register(self, selector: selectors.BaseSelector) -> None:
+        """Watch it."""
+        selector.register(self._server, selectors.EVENT_READ, self)
+
+    def ready(self, fd: int, selector: selectors.BaseSelector) -> None:
+        """A user, or bytes from the user."""
+        if fd == self._server.fileno():
+            user, _ = self._server.accept()
+            self._hang_up(selector)
+            user.setblocking(False)
+            self._user, self.fd = user, user.fileno()
+            selector.register(user, selectors.EVENT_READ, self)
+            self.line.opened()
+            return
+        try:
+            data = os.read(fd, 4096)
+        except ConnectionError as error:
+            log.debug("%s: %s", self.url, error)
+            data = b""
+        if data:
+            self.line.receive(data)
+        else:
+            self._hang_up(selector)
+
+    def _hang_up(self, selector: selectors.BaseSelector) -> None:
+        if self._user is not None:
+            selector.unregister(self._user)
+            self._user.close()
+            self.line.closed()
+        self._user, self.fd = None, -1
+
+    def close(self) -> None:
+        """No more users."""
+        if self._user is not None:
+            self._user.close()
+        self._server.close()
+        self.fd = -1
+
+
+class Server:
+    """Serves lines between `__enter__` and `__exit__`; `urls` by name. `folder`: of the terminals, None for TCP."""
+
+    def __init__(self, lines: Mapping[str, Line], folder: Path | None) -> None:
+        self._lines, self._folder = dict(lines), folder
+        self._ports: dict[str, Port] = {}
+        self._selector = selectors.DefaultSelector()
+        self._lock, self._end = threading.Lock(), threading.Event()
+        self._thread = threading.Thread(target=self._serve, name="emulated devices", daemon=True)
+
+    def __enter__(self) -> Self:
+        for name in self._lines:
+            self.plug(name)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._thread.join()
+        for port in self._ports.values():
+            port.close()
+        self._selector.close()
+
+    @property
+    def urls(self) -> dict[str, str]:
+        """Where the devices are."""
+        return {name: port.url for name, port in self._ports.items()}
+
+    def plug(self, name: str) -> None:
+        """Plug a device in; a terminal keeps its link's name, a TCP port gets a new number."""
+        with self._lock:
+            line = self._lines[name]
+            line.plug()
+            port: Port = TcpPort(line) if self._folder is None else PtyPort(line, self._folder / name)
+            port.register(self._selector)
+            self._ports[name] = port
+
+    def unplug(self, name: str) -> None:
+        """Pull a device's cable."""
+        with self._lock:
+            port = self._ports.pop(name)
+            for key in [k for k in self._selector.get_map().values() if k.data is port]:
+                self._selector.unregister(key.fileobj)
+            port.close()
+            self._lines[name].unplug()
+
+    def _serve(self) -> None:
+        while not self._end.is_set():
+            events = self._selector.select(self._pause())
+            with self._lock:
+                known = {id(port) for port in self._ports.values()}
+                for key, _ in events:
+                    if id(key.data) in known:
+                        key.data.ready(key.fd, self._selector)
+                for port_name, port in self._ports.items():
+                    if port.fd >= 0:
+                        self._send(self._lines[port_name], port.fd)
+
+    def _pause(self) -> float:
+        with self._lock:
+            coming = any(line.next_arrival() < math.inf for line in self._lines.values())
+        return POLL_S if coming else IDLE_S
+
+    def _send(self, line: Line, fd: int) -> None:
+        data = line.deliver(4096, 0.0)
+        if data:
+            try:
+                os.write(fd, data)
+            except (BlockingIOError, ConnectionError) as error:  # nobody reads: lost, as on a real line
+                log.debug("%d bytes lost: %s", len(data), error)

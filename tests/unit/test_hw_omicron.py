@@ -1,0 +1,305 @@
+"""The Omicron driver against the emulated laser: identity, power, emission, and every trap of its protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pytest
+from serial_fakes import BoardBench, LaserBench, TableBench
+
+from disco_twin.firmware.omicron import LaserHead, OmicronFirmware
+from disco_twin.firmware.wire import Fault, after, broken_by, garbled, late, lost, split
+from hw.devices.omicron import OmicronLaser, Status
+from hw.errors import DeviceError, DeviceFault, DeviceRefused, Garbled, NoAnswer, Unplugged, WrongDevice
+
+
+def emitting(bench: LaserBench, power_mw: float = 40.0) -> OmicronLaser:
+    laser = bench.connect()
+    laser.arm(power_mw)
+    laser.emit()
+    return laser
+
+
+# ---- identity
+
+
+def test_it_says_who_it_is() -> None:
+    laser = LaserBench().connect()
+    assert (laser.identity.model, laser.identity.wavelength_nm, laser.identity.max_power_mw) == ("LuxX", 532.0, 100.0)
+    assert laser.temperatures_c() == (25.1, None)
+
+
+@pytest.mark.parametrize("make", [BoardBench, TableBench])
+def test_another_device_on_the_port_is_refused(make: Callable[[], BoardBench | TableBench]) -> None:
+    with pytest.raises(WrongDevice, match=r"laser 532 nm is not an Omicron laser of 532 nm.*Remedy.*rig probe"):
+        OmicronLaser(make().link("laser 532 nm"), 532.0)
+
+
+def test_another_laser_is_refused_with_what_answered() -> None:
+    bench = LaserBench(head=LaserHead(476.0, 10.0))
+    with pytest.raises(WrongDevice, match="is not an Omicron laser of 532 nm: a LuxX of 476 nm answered"):
+        bench.connect()
+    bench = LaserBench(head=LaserHead(532.0, 10.0, model="LedHUB", device_id=20))
+    with pytest.raises(WrongDevice, match="LedHUB"):
+        bench.connect()
+
+
+# ---- power and emission
+
+
+def test_connecting_switches_a_running_laser_off_for_good() -> None:
+    """Also what would switch it on again: autostart, and what a power cut brings back."""
+    head = LaserHead(532.0, 100.0, stored_level=0xFFF, stored_mode=0x6018)
+    bench = LaserBench(head=head)
+    assert head.switch_on(bench.now())
+    bench.clock.sleep(10)
+    assert head.emission(bench.now()) == 1.0
+    bench.connect()
+    assert head.emission(bench.now()) == 0.0
+    bench.line.power_cycle()
+    bench.clock.sleep(10)
+    assert head.emission(bench.now()) == 0.0
+    assert not head.stored_mode & (1 << 3 | 1 << 4 | 1 << 14)
+
+
+def test_no_light_before_it_is_armed_and_told_to_emit() -> None:
+    bench = LaserBench()
+    laser = bench.connect()
+    with pytest.raises(DeviceRefused, match="is not armed"):
+        laser.emit()
+    laser.arm(40.0)
+    bench.clock.sleep(10.0)
+    assert bench.head.emission(bench.now()) == 0.0
+    before = bench.now()
+    laser.emit()
+    assert 3.0 <= bench.now() - before < 3.3
+    assert bench.head.emission(bench.now()) == pytest.approx(0.4)
+    assert laser.measured_mw() == pytest.approx(40.0)
+    assert Status.ON in laser.status()
+    laser.stop_emission()
+    assert bench.head.emission(bench.now()) == 0.0
+
+
+@pytest.mark.parametrize("power", [-1.0, 0.0, 100.1, float("nan")])
+def test_powers_that_the_laser_does_not_have_are_refused(power: float) -> None:
+    with pytest.raises(DeviceRefused, match="ask for more than 0 and at most 100 mW"):
+        LaserBench().connect().arm(power)
+
+
+def test_without_temporary_power_the_memory_is_spared() -> None:
+    """TPP answers !UK: SLP is used instead, and only where the level changes."""
+    bench = LaserBench(head=LaserHead(532.0, 100.0, knows_temporary_power=False))
+    for _ in range(5):
+        laser = bench.connect()
+    assert bench.head.memory_writes == 0
+    for _ in range(5):
+        laser.arm(100.0)
+    assert bench.head.memory_writes == 1
+    laser.emit()
+    assert laser.measured_mw() == 100.0
+
+
+# ---- interlock, key, reset
+
+
+def test_an_interlock_that_opens_is_named_and_needs_a_reset() -> None:
+    bench = LaserBench()
+    laser = emitting(bench)
+    bench.head.set_interlock(closed=False)
+    assert bench.head.emission(bench.now()) == 0.0
+    with pytest.raises(DeviceFault, match="the interlock is open"):
+        laser.require_ready()
+    with pytest.raises(DeviceFault, match=r"refused to emit: .*the interlock is open"):
+        laser.emit()
+    bench.head.set_interlock(closed=True)
+    with pytest.raises(DeviceFault, match="only a reset clears it"):
+        laser.require_ready()
+    before = bench.now()
+    laser.reset()
+    assert 5.0 <= bench.now() - before < 6.0
+    laser.arm(40.0)
+    laser.emit()
+
+
+def test_the_key_is_named() -> None:
+    bench = LaserBench()
+    laser = emitting(bench)
+    bench.head.set_key(on=False)
+    assert bench.head.emission(bench.now()) == 0.0
+    with pytest.raises(DeviceFault, match="key"):
+        laser.require_ready()
+    bench.head.set_key(on=True)
+    laser.require_ready()
+    bench.head.enabled = False
+    with pytest.raises(DeviceFault, match="enable pin"):
+        laser.require_ready()
+
+
+def test_an_interlock_during_the_preheating_ends_the_wait_with_its_name() -> None:
+    bench = LaserBench()
+    laser = bench.connect()
+    laser.arm(40.0)
+    bench.line.answer_faults.append(lambda data: (bench.head.set_interlock(closed=False), [(0.0, data)])[1])
+    with pytest.raises(DeviceFault, match="interlock"):
+        laser.emit()
+
+
+@pytest.mark.parametrize("reply", [b"!RsC\r", b"!RsC>\r"])
+def test_both_answers_to_a_reset_are_accepted(reply: bytes) -> None:
+    bench = LaserBench()
+    laser = bench.connect()
+    bench.line.answer_faults.append(lambda _: [(0.0, reply)])
+    laser.reset()
+    assert laser.status() & Status.POWERED
+
+
+def test_a_power_cycle_resets_the_separator() -> None:
+    bench = LaserBench()
+    laser = bench.connect()
+    assert laser.ask("GFw", "|") == "LuxX|4|1.90"
+    assert laser.ask("GFw") == "LuxX|4|1.90"
+    bench.line.power_cycle()
+    assert laser.ask("GFw") == "LuxX\xa74\xa71.90"
+
+
+# ---- the line
+
+RECOVERABLE: dict[str, Fault] = {
+    "lost": lost,
+    "late": late(0.7),
+    "very late": late(3.0),
+    "split": split(3),
+    "split slowly": split(5, 0.3),
+    "split too slowly": split(5, 0.7),
+    "nuls": after(b"\0\0\0"),
+    "garbage before": after(b"\x93\xfe\x07"),
+    "two in one read": after(b"!GWH123\r"),
+    "message before": after(b"$TPDd25.1\r"),
+    "message in it": broken_by(b"$TPDd25.1\r", 3),
+    "garbled letters": garbled(2),
+    "garbled mark": garbled(0),
+    "garbled end": garbled(-1),
+}
+
+
+@pytest.mark.parametrize("name", RECOVERABLE)
+@pytest.mark.parametrize("place", range(8))
+def test_reading_and_setting_survive_a_bad_line(name: str, place: int) -> None:
+    """One bad answer, anywhere in connecting and arming: the laser ends in the state that was asked for."""
+    bench = LaserBench()
+    bench.line.answer_faults.extend([None] * place + [RECOVERABLE[name]])
+    laser = emitting(bench)
+    assert laser.measured_mw() == pytest.approx(40.0)
+    assert laser.ask("GSN") == "4711"
+    assert bench.head.emission(bench.now()) == pytest.approx(0.4)
+
+
+def test_a_lost_command_is_given_again() -> None:
+    bench = LaserBench()
+    laser = emitting(bench)
+    bench.line.command_faults.append(lambda _: b"")
+    laser.stop_emission()
+    assert bench.head.emission(bench.now()) == 0.0
+    bench.line.command_faults.append(lambda data: data[:-1])  # without CR: the next command runs into it
+    assert laser.ask("GSN") == "4711"
+
+
+def test_a_late_answer_never_answers_the_next_question() -> None:
+    """Two readings of the same quantity: the second must be the present one, however late the first arrives."""
+    for delay in (0.3, 0.49, 0.51, 0.6, 1.0, 1.5, 2.5, 4.0):
+        bench = LaserBench()
+        laser = emitting(bench)
+        bench.line.answer_faults.append(late(delay))
+        first = [laser.measured_mw()]
+        laser._set_power(0.7)
+        assert laser.measured_mw() == pytest.approx(70.0), delay
+        assert first == [pytest.approx(40.0)]
+
+
+def test_emission_is_not_asked_for_twice() -> None:
+    """LOn is no setting: when its answer is lost, the status says whether it was understood."""
+    bench = LaserBench()
+    laser = bench.connect()
+    laser.arm(40.0)
+    asked = []
+    bench.line.command_faults.append(lambda data: (asked.append(data), data)[1])
+    bench.line.answer_faults.append(lost)
+    laser.emit()
+    assert asked == [b"?LOn\r"]
+    assert laser.measured_mw() == pytest.approx(40.0)
+
+
+def test_a_dead_laser_ends_in_one_line() -> None:
+    bench = LaserBench()
+    laser = bench.connect()
+    bench.line.command_faults.extend([lambda _: b""] * 100)
+    before = bench.now()
+    with pytest.raises(NoAnswer, match=r"laser 532 nm did not answer \?MDP within 0\.5 s\. Remedy"):
+        laser.measured_mw()
+    assert bench.now() - before < 10.0
+
+
+def test_nonsense_for_ever_ends_in_one_line() -> None:
+    bench = LaserBench()
+    laser = bench.connect()
+    bench.line.answer_faults.extend([lambda _: [(0.0, b"!MDP1q.2\r")]] * 100)
+    with pytest.raises(Garbled, match=r"answered \?MDP with '1q\.2', which makes no sense"):
+        laser.measured_mw()
+
+
+def test_a_failed_step_of_switching_off_does_not_stop_the_others() -> None:
+    bench = LaserBench()
+    laser = emitting(bench)
+
+    @dataclass
+    class Deaf:
+        """Drops every command with these letters."""
+
+        letters: bytes
+
+        def __call__(self, data: bytes) -> bytes:
+            return b"" if self.letters in data else data
+
+    bench.line.command_faults.extend([Deaf(b"LOf")] * 100)
+    with pytest.raises(DeviceError, match="LOf"):
+        laser.force_off()
+    assert bench.head.emission(bench.now()) == 0.0  # power and release went through
+
+
+def test_unplug_and_replug() -> None:
+    bench = LaserBench()
+    laser = emitting(bench)
+    bench.line.unplug()
+    with pytest.raises(Unplugged, match="laser 532 nm"):
+        laser.status()
+    assert bench.head.emission(bench.now()) > 0.0  # no watchdog: this is why interlocks exist
+    bench.line.plug()
+    bench.connect()
+    assert bench.head.emission(bench.now()) == 0.0
+
+
+def test_closing_switches_off_and_gives_the_port_back_even_when_it_is_gone() -> None:
+    bench = LaserBench()
+    laser = emitting(bench)
+    laser.close()
+    assert bench.head.emission(bench.now()) == 0.0
+    laser = emitting(bench)
+    bench.line.unplug()
+    with pytest.raises(Unplugged):
+        laser.close()
+
+
+def test_the_emulated_laser_answers_unknown_commands_and_bad_arguments() -> None:
+    """From Odemis's and Micro-Manager's descriptions: !UK, x."""
+    firmware = OmicronFirmware(LaserHead(532.0, 100.0))
+    for question, answer in (
+        (b"?XyZ\r", b"!UK\r"),
+        (b"?gfw\r", b"!UK\r"),
+        (b"?SLPG00\r", b"!SLPx\r"),
+        (b"?TPP101\r", b"!TPPx\r"),
+        (b"?ROM9\r", b"!ROMx\r"),
+        (b"?GLP\r", b"!GLP000\r"),
+        (b"?LOn\r", b"!LOn>\r"),
+    ):
+        assert [data for _, data in firmware.feed(question, 0.0)] == [answer]
