@@ -52,6 +52,7 @@ class StreamFiles:
                     key="format_version",
                     value=header[0],
                     allowed=str(FORMAT_VERSION),
+                    remedy="capture again into another folder",
                 )
             if header is not None:
                 return header[1]
@@ -74,13 +75,15 @@ class StreamFiles:
     def _journalled(self, index: int) -> Entry | None:
         return Entry.unpack(os.pread(self.journal, ENTRY_BYTES, HEADER_BYTES + index * ENTRY_BYTES), index)
 
-    def payload(self, entry: Entry) -> bytes:
-        return os.pread(self.images, entry.payload_bytes, entry.payload_offset)
+    def payload(self, entry: Entry) -> bytes | None:
+        """What is stored of an image; None if it is not what was written."""
+        data = os.pread(self.images, entry.payload_bytes, entry.payload_offset)
+        return data if len(data) == entry.payload_bytes and zlib.crc32(data) == entry.payload_crc else None
 
     def intact(self, index: int) -> bool:
         """Whether an image can be found and its checksum is right."""
         entry = self.entry(index)
-        return entry is not None and _crc(self.payload(entry), entry) == entry.payload_crc
+        return entry is not None and self.payload(entry) is not None
 
     def extent(self) -> tuple[int, int]:
         """(number of images, end of the last one in images.bin): what is there in full.
@@ -96,7 +99,7 @@ class StreamFiles:
         end = end_of(last)
         while True:
             further = Entry.unpack(os.pread(self.images, ENTRY_BYTES, end), count)
-            if further is None or _crc(self.payload(further), further) != further.payload_crc:
+            if further is None or self.payload(further) is None:
                 return count, end
             count, end = count + 1, further.end
 
@@ -104,10 +107,6 @@ class StreamFiles:
 def end_of(last: Entry | None) -> int:
     """Where the image after `last` begins in images.bin."""
     return HEADER_BYTES if last is None else last.end
-
-
-def _crc(payload: bytes, entry: Entry) -> int:
-    return zlib.crc32(payload) if len(payload) == entry.payload_bytes else -1
 
 
 def write_at(file: int, data: bytes, offset: int) -> None:

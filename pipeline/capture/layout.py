@@ -5,8 +5,7 @@
 exists twice, and a flipped bit anywhere costs at most the one image whose payload it hits. All integers and floats
 are little-endian.
 
-The payload is two Blosc2 chunks, exponents and charges. A chunk says how it was compressed, so the writer's settings
-can change without a new format version.
+The payload is what `pipeline.capture.codec` makes of a record, exponents before charges.
 """
 
 from __future__ import annotations
@@ -14,14 +13,8 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass
-from typing import Any
 
-import blosc2
-import numpy as np
-
-from hw.record import RawImage
-
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 IMAGES_MAGIC = b"DISCOIMG"
 JOURNAL_MAGIC = b"DISCOJRN"
 
@@ -101,43 +94,3 @@ def unpack_header(data: bytes, magic: bytes) -> tuple[int, bytes] | None:
         return None
     found, version, digest, _ = _HEADER.unpack(data)
     return (version, digest) if found == magic else None
-
-
-blosc2.set_releasegil(True)  # images are decoded in parallel, each by one thread
-
-
-def _settings(typesize: int) -> dict[str, Any]:
-    """Level and codec are chosen by measurement: the decision record has the figures."""
-    return {
-        "codec": blosc2.Codec.ZSTD,
-        "clevel": 1,
-        "filters": [blosc2.Filter.SHUFFLE if typesize > 1 else blosc2.Filter.NOFILTER],
-        "filters_meta": [0],
-        "typesize": typesize,
-        "nthreads": 1,
-    }
-
-
-_EXPONENT, _CHARGE = _settings(1), _settings(2)
-
-
-def encode(raw: RawImage) -> tuple[bytes, bytes]:
-    """Compressed exponents and charges."""
-    if raw.exponent.dtype != np.uint8 or raw.charge.dtype != np.uint16:
-        raise ValueError(f"a record is uint8 and uint16, not {raw.exponent.dtype} and {raw.charge.dtype}")
-    if raw.exponent.ndim != 2 or raw.exponent.shape != raw.charge.shape or not raw.exponent.size:
-        raise ValueError(f"a record has two equal shapes (height, width), not {raw.exponent.shape}, {raw.charge.shape}")
-    exponent, charge = np.ascontiguousarray(raw.exponent), np.ascontiguousarray(raw.charge, "<u2")
-    return blosc2.compress2(exponent, **_EXPONENT), blosc2.compress2(charge, **_CHARGE)
-
-
-def decode(entry: Entry, payload: bytes) -> RawImage | None:
-    """The image, or None if the payload is not the one that was stored."""
-    if len(payload) != entry.payload_bytes or zlib.crc32(payload) != entry.payload_crc:
-        return None
-    exponent = np.empty((entry.height, entry.width), np.uint8)
-    charge = np.empty((entry.height, entry.width), "<u2")
-    view = memoryview(payload)
-    blosc2.decompress2(view[: entry.exponent_bytes], dst=exponent, nthreads=1)
-    blosc2.decompress2(view[entry.exponent_bytes :], dst=charge, nthreads=1)
-    return RawImage(exponent, charge.astype(np.uint16, copy=False))

@@ -19,6 +19,7 @@ from typing import Self
 
 from hw.errors import DiscoError, InputError
 from hw.record import RawImage
+from pipeline.capture.codec import decode, encode
 from pipeline.capture.files import (
     IMAGES,
     PLAN,
@@ -36,11 +37,10 @@ from pipeline.capture.layout import (
     JOURNAL_MAGIC,
     Entry,
     ImageMeta,
-    decode,
-    encode,
     pack_header,
 )
 from pipeline.capture.plan import ImageAddress, Plan, load_plan
+from pipeline.resources import usable_cores
 
 __all__ = ["CorruptImage", "ImageMeta", "StorageError", "StreamReader", "StreamWriter"]
 
@@ -78,6 +78,7 @@ class StreamWriter:
         except BaseException:
             self._files.close()
             raise
+        self._pool = ThreadPoolExecutor(usable_cores(), thread_name_prefix="encode")
 
     def _lock(self, folder: Path) -> None:
         try:
@@ -142,7 +143,7 @@ class StreamWriter:
         count, end = self._place
         if self.plan.index(address) != count:
             raise ValueError(f"{address} is image {self.plan.index(address)}, but image {count} is next")
-        exponent, charge = encode(raw)
+        exponent, charge = encode(raw, self._pool)
         crc = zlib.crc32(charge, zlib.crc32(exponent))
         height, width = raw.exponent.shape
         entry = Entry(count, height, width, end, len(exponent), len(charge), meta, crc)
@@ -181,6 +182,7 @@ class StreamWriter:
         except OSError as error:
             raise storage_error(self._files.folder, len(self), error) from error
         finally:
+            self._pool.shutdown()
             self._files.close()
 
     def __enter__(self) -> Self:
@@ -240,10 +242,11 @@ class StreamReader:
     def read(self, which: int | ImageAddress) -> RawImage:
         """An image, by its index or address. Raises `CorruptImage`."""
         entry = self._entry(which)
-        raw = decode(entry, self._files.payload(entry))
-        if raw is None:
+        payload = self._files.payload(entry)
+        if payload is None:
             raise CorruptImage(entry.index, self.plan.address(entry.index), "its checksum differs")
-        return raw
+        exponents, charges = payload[: entry.exponent_bytes], payload[entry.exponent_bytes :]
+        return decode((entry.height, entry.width), exponents, charges)
 
     def _read_or_reason(self, which: int | ImageAddress) -> RawImage | CorruptImage:
         try:

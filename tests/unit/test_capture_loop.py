@@ -243,7 +243,8 @@ def test_the_folder_of_another_plan_is_refused_before_the_rig_is_on(tmp_path: Pa
 
 # --- SIGKILL ---------------------------------------------------------------------------------------------------------
 
-LONG = small_plan((40, 25, 30))
+LONG = small_plan((200, 125, 150))
+KILLS = 200
 
 
 def _child(folder: Path, report: int, credit: int, budget: int | None) -> None:
@@ -290,7 +291,7 @@ def _capture_and_kill(folder: Path, budget: int | None, kill_at: int) -> tuple[i
 
 
 @pytest.mark.parametrize("how", ["at a byte", "from outside"])
-def test_sigkill_at_twenty_moments_loses_nothing_that_was_reported(tmp_path: Path, how: str) -> None:
+def test_sigkill_at_200_moments_loses_nothing_that_was_reported(tmp_path: Path, how: str) -> None:
     """Kill, look, resume, kill again ...: what was reported is there and whole, the end equals an undisturbed capture.
 
     "at a byte": in the middle of a write, at random bytes of entries, payloads and journal, on their boundaries too.
@@ -301,17 +302,19 @@ def test_sigkill_at_twenty_moments_loses_nothing_that_was_reported(tmp_path: Pat
     capture(FakeRig(LONG), LONG, whole)
     size = sum(len(data) for name, data in contents(whole).items() if name != "plan.json")
     kills = stored = 0
-    for _ in range(20):
-        bytes_left = choose.choice([1, 63, 64, 65, 128, 129, *(choose.randint(1, size // 12) for _ in range(6))])
+    for _ in range(KILLS):
+        bytes_left = choose.choice(
+            [1, 63, 64, 65, 128, 129, *(choose.randint(1, size * 5 // (3 * KILLS)) for _ in range(6))]
+        )
         budget = bytes_left if how == "at a byte" else None
-        last, killed = _capture_and_kill(folder, budget, stored + choose.randint(1, len(LONG) // 25))
+        last, killed = _capture_and_kill(folder, budget, stored + choose.randint(1, len(LONG) * 4 // (5 * KILLS)))
         kills += killed
         if (folder / "plan.json").exists() and (folder / "journal.bin").exists() and max(last, stored):
             with StreamReader(folder) as stream:
                 assert len(stream) >= max(last, stored)
                 assert stream.verify() == []
                 stored = len(stream)
-    assert kills == 20
+    assert kills == KILLS
     assert 0 < stored < len(LONG)
     report = capture(FakeRig(LONG), LONG, folder)
     assert report.resumed_at == stored

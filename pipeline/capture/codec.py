@@ -1,0 +1,96 @@
+"""The compression of one raw record, without loss.
+
+Almost all that a record holds is noise, a few counts of it in the dark and more where there is light. Prediction only
+adds the noise of the predictor, so what counts is to code every histogram as its own:
+
+1. Charges are cut into runs of 32 pixels along the rows. A run's kind is the bit length of its largest less its
+   smallest charge: runs of one kind are noise of like size, whatever the sensor's offset and gain.
+2. The runs of one kind, in the order of the image, are coded by pcodec: adaptive bins, asymmetric numeral systems for
+   the bin and plain bits within it. It also decides whether differences between neighbours are smaller. Large kinds
+   are coded in pieces, so that cores can share an image.
+3. Exponents, which are rarely anything but zero, and the kinds are compressed by zstd.
+
+Both libraries release Python's lock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import Executor
+
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+from pcodec import ChunkConfig, ModeSpec, standalone
+
+from hw.record import RawImage
+
+U8 = NDArray[np.uint8]
+U16 = NDArray[np.uint16]
+
+RUN = 32  # pixels
+PIECE = 2048  # runs that are coded together at most
+QUIETEST = 3  # bits; telling still quieter runs apart would cost more than it saves
+ZSTD_LEVEL = 1
+_PCO = ChunkConfig(compression_level=5, mode_spec=ModeSpec.classic())
+
+
+def encode(raw: RawImage, pool: Executor | None = None) -> tuple[bytes, bytes]:
+    """(exponents and kinds, charges), both compressed; the same bytes with and without a pool to share the work."""
+    if raw.exponent.dtype != np.uint8 or raw.charge.dtype != np.uint16:
+        raise ValueError(f"a record is uint8 and uint16, not {raw.exponent.dtype} and {raw.charge.dtype}")
+    if raw.exponent.ndim != 2 or raw.exponent.shape != raw.charge.shape or not raw.exponent.size:
+        raise ValueError(f"a record has two equal shapes (height, width), not {raw.exponent.shape}, {raw.charge.shape}")
+    coding = map if pool is None else pool.map
+    runs = _runs(raw.charge)
+    kinds = np.frexp((runs.max(axis=1) - runs.min(axis=1)).astype(np.float32))[1].astype(np.uint8)
+    np.maximum(kinds, QUIETEST, out=kinds)
+    sorted_runs = runs[_order(kinds)]
+    pieces = coding(_encode_piece, [sorted_runs[piece] for piece in _pieces(kinds)])
+    exponents = zstandard.compress(raw.exponent.tobytes() + kinds.tobytes(), ZSTD_LEVEL)
+    coded = list(pieces)
+    lengths = np.array([len(piece) for piece in coded], "<u4")
+    return exponents, lengths.tobytes() + b"".join(coded)
+
+
+def decode(shape: tuple[int, int], exponents: bytes, charges: bytes) -> RawImage:
+    """The record of `shape` (height, width) from the two results of `encode`."""
+    size = shape[0] * shape[1]
+    plain = np.frombuffer(zstandard.decompress(exponents), np.uint8)
+    kinds = plain[size:]
+    pieces = list(_pieces(kinds))
+    ends = 4 * len(pieces) + np.cumsum(np.frombuffer(charges, "<u4", len(pieces)), dtype=np.int64)
+    sorted_runs = np.empty((len(kinds), RUN), np.uint16)
+    start = 4 * len(pieces)
+    for piece, end in zip(pieces, ends.tolist(), strict=True):
+        standalone.simple_decompress_into(charges[start:end], sorted_runs[piece].reshape(-1))
+        start = end
+    runs = np.empty_like(sorted_runs)
+    runs[_order(kinds)] = sorted_runs
+    return RawImage(plain[:size].reshape(shape), runs.reshape(-1)[:size].reshape(shape))
+
+
+def _runs(charge: U16) -> U16:
+    """(n, RUN): the image's pixels row after row; the last one is repeated to fill the last run."""
+    flat = np.ascontiguousarray(charge).reshape(-1)
+    return (
+        np.pad(flat, (0, -flat.size % RUN), mode="edge").reshape(-1, RUN) if flat.size % RUN else flat.reshape(-1, RUN)
+    )
+
+
+def _order(kinds: U8) -> NDArray[np.int64]:
+    """Indices that bring runs of one kind together and keep the image's order within."""
+    return np.argsort(kinds, kind="stable")
+
+
+def _pieces(kinds: U8) -> Iterator[slice]:
+    """The sorted runs that are coded together, in order."""
+    low = 0
+    for count in np.bincount(kinds).tolist():
+        for first in range(low, low + count, PIECE):
+            yield slice(first, min(first + PIECE, low + count))
+        low += count
+
+
+def _encode_piece(runs: U16) -> bytes:
+    return bytes(standalone.simple_compress(runs.reshape(-1), _PCO))
