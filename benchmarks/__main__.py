@@ -21,6 +21,7 @@ from pipeline.resources import measured, usable_cores
 REGISTRY = {
     "irradiance": "benchmarks.irradiance",
     "pareto": "benchmarks.pareto",
+    "stream": "benchmarks.stream",
     "walk": "benchmarks.walk",
 }
 
@@ -55,14 +56,21 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def readable(record: dict[str, Any]) -> Iterator[str]:
-    """A table: the plain figures, then a line for every point of a curve."""
+    """A table: the plain figures, a line for every row of a list, then one for every point of a curve."""
     for key, value in record.items():
         if not isinstance(value, list | dict):
-            yield f"{key:<24} {value:.4g}" if isinstance(value, float) else f"{key:<24} {value}"
+            yield f"{key:<24} {_short(value)}"
+    for rows in (value for key, value in record.items() if isinstance(value, list) and key != "curves"):
+        for row in rows:
+            yield "  ".join(f"{name} {_short(value)}" for name, value in row.items())
     for curve in record.get("curves", []):
         for point in curve["points"]:
             settings = ", ".join(f"{k} {v}" for k, v in point.get("settings", {}).items())
             yield f"{curve['name']:<24} {point['seconds']:9.3f} s   error {point['error']:.3g}   {settings}"
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _cpu_seconds() -> float:
