@@ -105,11 +105,16 @@ def test_a_damaged_image_costs_itself(captured, tmp_path: Path) -> None:  # type
     folder, mesh = captured
     copy = tmp_path / "capture"
     shutil.copytree(folder, copy)
+    samples, _ = samples_of(folder, mesh, footprint_reading)
+    used = np.flatnonzero(samples.spots.transmitted > 0)
+    with StreamReader(folder) as stream:
+        hit = next(a for a in stream.plan.addresses() if a.spot == used[len(used) // 2])
+        at = stream._entry(hit).payload_offset + 5
     blob = bytearray((copy / "images.bin").read_bytes())
-    blob[len(blob) // 2] ^= 0xFF
+    blob[at] ^= 0xFF
     (copy / "images.bin").write_bytes(blob)
     _, statistics = samples_of(copy, mesh, footprint_reading)
-    assert len(statistics.corrupt) == 1
+    assert statistics.corrupt == (str(hit),)
 
 
 def test_noise_estimate_is_unbiased_and_blind_to_slopes() -> None:
