@@ -9,8 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.console import Console
 
-from disco_twin.folder import refused_by_the_disk
-from hw.errors import DiscoError
+from hw.errors import DiscoError, naming, refused_by_the_disk
 from pipeline.capture.loop import Interrupted
 
 app = typer.Typer(
@@ -36,9 +35,10 @@ def run(scene: SceneFile, out: RunOut, profile: ProfileOption = "full", methods:
     """Capture, reconstruct, relight and score; writes summary.json and report.html. The same command resumes."""
     from disco_twin.run import open_run, print_scores, run_all
 
-    opened = open_run(scene, out, profile, methods, console)
-    console.print(f"[bold]{opened.scene.name}[/bold] into {out}", highlight=False)
-    summary = run_all(opened)
+    with naming(scene):
+        opened = open_run(scene, out, profile, methods, console)
+        console.print(f"[bold]{opened.scene.name}[/bold] into {out}", highlight=False)
+        summary = run_all(opened)
     print_scores(summary, opened.methods, console)
     console.print(f"\nreport: {opened.folder.report_file.resolve()}", soft_wrap=True, highlight=False)
 
@@ -49,9 +49,10 @@ def capture(scene: SceneFile, out: RunOut, profile: ProfileOption = "full") -> N
     from disco_twin.console import run_log
     from disco_twin.run import capture_stages, open_run
 
-    opened = open_run(scene, out, profile, None, console)
-    with run_log(opened.folder.root / "run.log"):
-        capture_stages(opened)
+    with naming(scene):
+        opened = open_run(scene, out, profile, None, console)
+        with run_log(opened.folder.root / "run.log", console):
+            capture_stages(opened)
 
 
 @app.command()
@@ -61,7 +62,7 @@ def reconstruct(out: RunOut, methods: MethodsOption = None) -> None:
     from disco_twin.run import pipeline_stage, reopen_run
 
     opened = reopen_run(out, methods, console)
-    with run_log(opened.folder.root / "run.log"):
+    with naming(opened.scene_file), run_log(opened.folder.root / "run.log", console):
         pipeline_stage(opened)
 
 
@@ -70,12 +71,14 @@ def reference(scene: SceneFile, out: RunOut, profile: ProfileOption = "full") ->
     """Render the reference images of a scene into DIR, one EXR per light and held-out view."""
     from disco_twin.console import stage_bar
     from disco_twin.scene import load_scene
-    from disco_twin.simulate import render_references, shipped_references
+    from disco_twin.simulate import render_references, require_capturable, shipped_references
     from disco_twin.world import World
 
     loaded = load_scene(scene, profile)
-    with stage_bar(console, "references", "lights") as report:
-        lights = render_references(World(loaded), shipped_references(scene, loaded.name), out, report)
+    with naming(scene), stage_bar(console, "references", "lights") as report:
+        world = World(loaded)
+        require_capturable(world)
+        lights = render_references(world, shipped_references(scene, loaded.name), out, report)
     console.print(f"{lights} lights rendered, {len(loaded.relight.lights) - lights} were there", highlight=False)
 
 
@@ -86,7 +89,7 @@ def score(out: RunOut, methods: MethodsOption = None) -> None:
     from disco_twin.run import print_scores, reopen_run, score_stages
 
     opened = reopen_run(out, methods, console)
-    with run_log(opened.folder.root / "run.log"):
+    with naming(opened.scene_file), run_log(opened.folder.root / "run.log", console):
         print_scores(score_stages(opened), opened.methods, console)
 
 
@@ -95,9 +98,14 @@ def plan(scene: SceneFile, profile: ProfileOption = "full") -> None:
     """Predict images, bytes and time of a scene, and say what it leaves out. Needs no renderer."""
     from disco_twin.predict import predict
     from disco_twin.scene import load_scene
+    from disco_twin.simulate import require_capturable
     from disco_twin.world import World
 
-    for name, value in predict(World(load_scene(scene, profile))):
+    with naming(scene):
+        world = World(load_scene(scene, profile))
+        require_capturable(world)
+        lines = predict(world)
+    for name, value in lines:
         console.print(f"  {name:<12} {value}", highlight=False, soft_wrap=True)
 
 
@@ -124,6 +132,8 @@ def main(arguments: list[str] | None = None) -> Any:
     except OSError as error:
         known = refused_by_the_disk(error, Path.cwd())
         return _stop(str(known or f"{error.filename or 'input or output'}: {error.strerror or error}"), 2)
+    except MemoryError:
+        return _stop("not enough memory. Remedy: fewer pixels, spots or scan.vertices, or a machine with more", 2)
 
 
 def _stop(message: str, status: int) -> None:

@@ -68,17 +68,45 @@ def stage_bar(console: Console, name: str, unit: str) -> Iterator[Report]:
 
 
 @contextmanager
-def run_log(path: Path) -> Iterator[None]:
-    """Our own log messages of a run go to a file, with times."""
-    handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+def run_log(path: Path, console: Console) -> Iterator[None]:
+    """Our own log messages of a run go to a file, with times; warnings go to the screen, too, a line each."""
+    screen = _Screen(console)
+    file = _LogFile(path, console)
     loggers = [logging.getLogger(name) for name in ("disco_twin", "pipeline", "hw")]
     for logger in loggers:
-        logger.addHandler(handler)
+        logger.addHandler(file)
+        logger.addHandler(screen)
         logger.setLevel(logging.INFO)
     try:
         yield
     finally:
         for logger in loggers:
-            logger.removeHandler(handler)
-        handler.close()
+            logger.removeHandler(file)
+            logger.removeHandler(screen)
+        file.close()
+
+
+class _Screen(logging.Handler):
+    """Warnings on the screen, above the progress bar."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(logging.WARNING)
+        self.console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = f"  warning: {record.getMessage()}"
+        self.console.print(text, style="yellow", highlight=False, markup=False, soft_wrap=True)
+
+
+class _LogFile(logging.FileHandler):
+    """run.log. A disk that takes no more of it is said once, on the screen, and does not end the run."""
+
+    def __init__(self, path: Path, console: Console) -> None:
+        super().__init__(path, encoding="utf-8")
+        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        self.console, self.refused = console, False
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        if not self.refused:
+            self.console.print(f"  warning: {self.baseFilename} takes no more messages", style="yellow", markup=False)
+        self.refused = True

@@ -7,22 +7,25 @@ OUT/twin/       what the pipeline never sees: the simulated responses, true R_d,
 
 from __future__ import annotations
 
-import errno
+import fcntl
 import hashlib
 import json
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from hw.errors import DiscoError, InputError
+from pipeline.config import Strict, as_table, read_json
 from pipeline.resources import measured
 
 log = logging.getLogger(__name__)
 
 FORMAT_VERSION = 1
+FOLDERS = ("capture", "twin", "work")
 
 
 @dataclass
@@ -103,7 +106,7 @@ class RunFolder:
                     file=root,
                     remedy="choose another --out, or delete this one",
                 )
-        elif root.is_dir() and any(root.iterdir()):
+        elif root.is_dir() and not _barely_begun(root):
             raise InputError("the folder is not empty and holds no run", file=root, remedy="choose another --out")
         folder.identity = identity
         for path in (folder.capture, folder.twin, folder.work):
@@ -127,6 +130,13 @@ class RunFolder:
         if record is None or record.key != key:
             record = StageRecord(name, key)
         self.stages[name] = record
+        with self._alone():
+            self._save()  # whatever ends this process from here on, the files are no longer those of a finished stage
+            self._work(record, work, outputs)
+        return True
+
+    def _work(self, record: StageRecord, work: Callable[[], float | None], outputs: Sequence[str]) -> None:
+        """Do a stage and write down what it took, whether it comes to its end or not."""
         child: float | None = None
         usage = None
         try:
@@ -140,22 +150,26 @@ class RunFolder:
                 record.seconds += usage.seconds
                 record.peak_mb = max(record.peak_mb, usage.peak_mb if child is None else child)
             self._save()
-        return True
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """No other process works in the folder meanwhile."""
+        handle = os.open(self.root, os.O_RDONLY)
+        try:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise DiscoError(
+                    f"{self.root}: another process works in this folder. Remedy: wait for it, or choose another --out"
+                ) from error
+            yield
+        finally:
+            os.close(handle)
 
     def _load(self) -> None:
-        try:
-            data = json.loads(self.journal.read_text())
-            if data["format_version"] != FORMAT_VERSION:
-                raise InputError(
-                    f"format_version is {data['format_version']}",
-                    file=self.journal,
-                    allowed=str(FORMAT_VERSION),
-                    remedy="choose another --out",
-                )
-            self.identity = data["identity"]
-            self.stages = {s["name"]: StageRecord(**s) for s in data["stages"]}
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(f"is damaged ({error})", file=self.journal, remedy="choose another --out") from error
+        data = read_json(self.journal, _Journal, "choose another --out")
+        self.identity = data.identity
+        self.stages = {record.name: record for record in data.stages}
 
     def _save(self) -> None:
         data = {
@@ -166,27 +180,35 @@ class RunFolder:
         write_atomically(self.journal, json.dumps(data, indent=1).encode())
 
 
-def refused_by_the_disk(error: OSError, folder: Path) -> DiscoError | None:
-    """A full or write-protected disk as an error for the user; None for any other reason.
+class _Journal(Strict):
+    """stages.json."""
 
-    NumPy reports a full disk without an error number ("16 requested and 0 written").
-    """
-    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or "requested and" in str(error)
-    if not full and error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return None
-    why = "the disk is full" if full else (error.strerror or str(error)).lower()
-    remedy = "make room" if full else "choose another --out"
-    return DiscoError(f"{error.filename or folder}: {why}. Remedy: {remedy}, repeat the same command")
+    format_version: Literal[1]
+    identity: str
+    stages: tuple[Annotated[StageRecord, as_table(StageRecord)], ...]
+
+
+def _barely_begun(root: Path) -> bool:
+    """Whether a folder without a journal is one that a run could not finish making (a full disk, a kill), or empty."""
+    files = {"scene.toml", "scene.toml.part", "stages.json.part"}
+    return all(path.name in files or (path.name in FOLDERS and not any(path.iterdir())) for path in root.iterdir())
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file as a whole: a reader, or a run after a crash, sees the old content or the new."""
+    """Replace a file as a whole: a reader, or a run after a crash, sees the old content or the new.
+
+    Where the disk refuses, the error names the file, and nothing is left of what was not written in full.
+    """
     temporary = path.with_name(path.name + ".part")
-    with temporary.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def content_key(*parts: Any) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from disco_twin.figures import Comparison, Impulse
 from disco_twin.folder import RunFolder
+from disco_twin.pipeline_process import load_results
 from disco_twin.report import ReportData
 from disco_twin.score import load_model, load_relit, load_scores
 from disco_twin.simulate import reference_path
@@ -37,7 +37,7 @@ def collect(world: World, folder: RunFolder, summary: dict[str, Any]) -> ReportD
     for method in methods:
         if (model := load_model(folder, method)) is not None:
             models[method] = np.asarray(model.reflectance[:, truth.columns], np.float64)
-    made = json.loads((folder.work / "pipeline.json").read_text())
+    made = load_results(folder)
     launched = truth.balance.launched
     return ReportData(
         summary=summary,
@@ -49,13 +49,13 @@ def collect(world: World, folder: RunFolder, summary: dict[str, Any]) -> ReportD
         truth=truth.mean,
         models=models,
         decades={m: scores for m, scores in load_scores(folder)["reflectance"].items() if scores is not None},
-        seconds={name: float(entry["seconds"]) for name, entry in made["methods"].items()},
+        seconds={name: entry.seconds for name, entry in made.methods.items()},
         balance={
             term: list(getattr(truth.balance, term) / launched)
             for term in ("escaped", "absorbed", "reflected", "boundary", "inside")
         },
         imbalance=float(np.abs(truth.balance.residual).max()),
-        notes=[*notes(world), *damaged, *made["warnings"]],
+        notes=[*notes(world), *damaged, *made.warnings],
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,14 +11,16 @@ from typing import Any, get_args
 from rich.console import Console
 
 from disco_twin.console import Report, run_log, stage_bar
-from disco_twin.folder import RunFolder, content_key, refused_by_the_disk, source_key, write_atomically
-from disco_twin.pipeline_process import pipeline_inputs, reconstruct_apart
+from disco_twin.folder import RunFolder, content_key, source_key, write_atomically
+from disco_twin.pipeline_process import load_results, pipeline_inputs, reconstruct_apart, stale
 from disco_twin.scene import Profile, Scene, load_scene
 from disco_twin.world import World, identity, left_out_by_the_twin
-from hw.errors import InputError
+from hw.errors import InputError, refused_by_the_disk
 from pipeline.capture.files import IMAGES, JOURNAL, PLAN
 from pipeline.capture.loop import Interrupted
+from pipeline.config import read_json
 from pipeline.reconstruct.settings import Method
+from pipeline.records import StageFigures
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +31,7 @@ OUTPUTS = {  # files that a finished stage leaves, as patterns in the run folder
     "capture": ("capture/images.bin", "capture/journal.bin", "capture/plan.json"),
     "truth": ("twin/truth.npz",),
     "references": ("twin/references/*.exr",),
-    "pipeline": ("work/pipeline.json", "work/model-*.npz", "work/relit/*/*.npy"),
+    "pipeline": ("work/pipeline.json", "work/model-*.npz", "work/request.json", "work/relit/*/*.npy"),
     "scores": ("twin/scores.json",),
 }
 LIGHT_CODE = tuple(f"disco_twin.{part}" for part in ("object", "light", "camera", "rig", "deviation", "faults"))
@@ -82,12 +83,7 @@ def open_run(scene_file: Path, out: Path, profile: Profile, methods: str | None,
 def reopen_run(out: Path, methods: str | None, console: Console) -> Run:
     """An existing run folder, to do a part of it again."""
     folder = RunFolder.open(out)
-    record = out / SCENE_RECORD
-    try:
-        scene = Scene.model_validate_json(record.read_bytes())
-    except (OSError, ValueError) as error:
-        problem = str(error).splitlines()[0]
-        raise InputError(f"cannot be read ({problem})", file=record, remedy="disco-twin run") from error
+    scene = read_json(out / SCENE_RECORD, Scene, f"disco-twin run SCENE --out {out} writes it anew")
     return Run(World(scene), folder, folder.scene_file, choose_methods(methods, scene), console)
 
 
@@ -166,6 +162,8 @@ def pipeline_stage(run: Run) -> None:
     code = light_key(run), source_key("pipeline"), source_key("hw")
     key = content_key(run.folder.identity, pipeline_inputs(run.scene, run.methods), *code)
     run.stage("pipeline", key, lambda _: reconstruct_apart(run.scene, run.folder, run.methods))
+    for warning in load_results(run.folder).warnings:
+        log.warning("%s", warning)
 
 
 def score_stages(run: Run) -> dict[str, Any]:
@@ -179,6 +177,9 @@ def score_stages(run: Run) -> dict[str, Any]:
     for name in ("capture", "truth", "references", "pipeline"):
         if name not in stages or not stages[name].finished:
             raise InputError(f"the stage {name} is not finished", file=run.folder.root, remedy="disco-twin run")
+    if why := stale(run.scene, run.folder, run.methods):
+        remedy = f"disco-twin reconstruct --out {run.folder.root} --methods {','.join(run.methods)}"
+        raise InputError(why, file=run.folder.work, key="--methods", value=",".join(run.methods), remedy=remedy)
     key = content_key(
         *(stages[name].key for name in ("truth", "references", "pipeline")),
         list(run.methods),
@@ -186,33 +187,33 @@ def score_stages(run: Run) -> dict[str, Any]:
         source_key("pipeline.relight.scores"),
     )
     run.stage("scores", key, lambda _: score_run(run.world, run.folder, run.methods))
-    made = json.loads((run.folder.work / "pipeline.json").read_text())
-    left_out = [*left_out_by_the_twin(run.world), *made["left_out"]]
+    made = load_results(run.folder)
+    left_out = [*left_out_by_the_twin(run.world), *made.left_out]
     summary = make_summary(
-        run.scene, run.folder, run.methods[0], stage_rows(run.folder, made["stages"]), load_scores(run.folder), left_out
+        run.scene, run.folder, run.methods[0], stage_rows(run.folder, made.stages), load_scores(run.folder), left_out
     )
     write_summary(summary, run.folder.summary_file)
     write_report(collect(run.world, run.folder, summary), run.folder.report_file)
     return summary
 
 
-def stage_rows(folder: RunFolder, parts: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def stage_rows(folder: RunFolder, parts: Sequence[StageFigures]) -> list[dict[str, Any]]:
     """Rows {name, seconds, peak_mb} in the order of the work; the pipeline's process is shown by its parts."""
     rows: list[dict[str, Any]] = []
     for stage in folder.stages.values():
         if stage.name != "pipeline":
             rows.append({"name": stage.name, "seconds": stage.seconds, "peak_mb": stage.peak_mb})
             continue
-        start = max(stage.seconds - sum(p["seconds"] for p in parts), 0.0)
-        lowest = min((p["peak_mb"] for p in parts), default=stage.peak_mb)
+        start = max(stage.seconds - sum(p.seconds for p in parts), 0.0)
+        lowest = min((p.peak_mb for p in parts), default=stage.peak_mb)
         rows.append({"name": "start the pipeline", "seconds": start, "peak_mb": lowest})
-        rows.extend({k: p[k] for k in ("name", "seconds", "peak_mb")} for p in parts)
+        rows.extend(p.model_dump() for p in parts)
     return rows
 
 
 def run_all(run: Run) -> dict[str, Any]:
     """Everything, from the scan to the report."""
-    with run_log(run.folder.root / "run.log"):
+    with run_log(run.folder.root / "run.log", run.console):
         capture_stages(run)
         truth_stages(run)
         pipeline_stage(run)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from disco_twin.object.schema import ObjectConfig
 from pipeline.config import Strict, load_toml
@@ -17,10 +17,19 @@ Count = Annotated[int, Field(ge=1, le=10**10)]
 Profile = Literal["full", "small"]
 
 
+MOST_VERTICES = 20_000  # R_d holds vertices^2 entries a laser, with their variance: 3.2 GB each at this size
+
+
+def _storable(vertices: int) -> int:
+    if vertices > MOST_VERTICES:
+        raise ValueError(f"R_d holds the square of that for every laser, at most {MOST_VERTICES} vertices fit")
+    return vertices
+
+
 class ScanConfig(Strict):
     """The mesh that the pipeline is given: about `vertices` vertices, or (left out) the object's own mesh."""
 
-    vertices: Annotated[int, Field(ge=50, le=1_000_000)] | None = None
+    vertices: Annotated[int, Field(ge=50), AfterValidator(_storable)] | None = None
 
 
 class SimulationConfig(Strict):
@@ -50,7 +59,7 @@ class RelightConfig(Strict):
         unknown = [light for light in lights if isinstance(light, str) and light not in shipped]
         if unknown:
             raise ValueError(f"unknown light {unknown[0]!r}, shipped are {', '.join(shipped)}")
-        return [shipped[light] if isinstance(light, str) else light for light in lights or shipped]
+        return tuple(shipped[light] if isinstance(light, str) else light for light in lights or shipped)
 
 
 class Scene(Strict):

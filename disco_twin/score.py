@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from disco_twin.folder import RunFolder, write_atomically
 from disco_twin.simulate import reference_path
 from disco_twin.world import World
 from hw.errors import InputError
+from pipeline.config import Strict, read_json
 
 if TYPE_CHECKING:
     from pipeline.reconstruct.model import ReflectanceModel
@@ -26,6 +27,14 @@ log = logging.getLogger(__name__)
 FORMAT_VERSION = 1
 KEPT = ("nrmse", "nrmse_se", "nrmse_floor", "psnr", "energy_ratio")
 F32 = NDArray[np.float32]
+
+
+class _Scores(Strict):
+    """scores.json."""
+
+    format_version: Literal[1]
+    relit: tuple[dict[str, float | str | None], ...]
+    reflectance: dict[str, dict[str, dict[str, float | None]] | None]
 
 
 def score_run(world: World, folder: RunFolder, methods: Sequence[str]) -> None:
@@ -45,10 +54,8 @@ def scores_file(folder: RunFolder) -> Path:
 
 def load_scores(folder: RunFolder) -> dict[str, Any]:
     """What `score_run` wrote."""
-    data: dict[str, Any] = json.loads(scores_file(folder).read_text())
-    if data["format_version"] != FORMAT_VERSION:
-        raise InputError("unknown format_version", file=scores_file(folder), remedy="disco-twin score")
-    return data
+    remedy = f"delete it, then disco-twin score --out {folder.root}"
+    return read_json(scores_file(folder), _Scores, remedy).model_dump()
 
 
 def score_relit_images(world: World, folder: RunFolder, methods: Sequence[str]) -> list[dict[str, Any]]:
@@ -87,7 +94,11 @@ def load_relit(folder: RunFolder, method: str, light: str, view: str) -> F32:
     path = folder.work / "relit" / method / f"{light}@{view}.npy"
     if not path.is_file():
         raise InputError("is missing", file=path, remedy=f"disco-twin reconstruct --out {folder.root}")
-    return np.asarray(np.load(path, allow_pickle=False))
+    try:
+        return np.asarray(np.load(path, allow_pickle=False))
+    except (OSError, ValueError, EOFError, SyntaxError) as error:
+        remedy = f"delete it, then disco-twin reconstruct --out {folder.root}"
+        raise InputError("is damaged", file=path, remedy=remedy) from error
 
 
 def load_model(folder: RunFolder, method: str) -> ReflectanceModel | None:

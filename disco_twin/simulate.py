@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,13 +14,12 @@ from disco_twin.folder import RunFolder, write_atomically
 from disco_twin.world import World, reference_key
 from hw.errors import InputError
 from pipeline.calibrate.camera import PinholeCamera
-from pipeline.capture.sweep import sees
+from pipeline.capture.sight import require_in_sight
+from pipeline.records import RigFile, SensorFile
 from pipeline.relight.lights import Light
 from pipeline.rig import CameraConfig, FaultsConfig
 
 if TYPE_CHECKING:
-    import trimesh
-
     from disco_twin.light.truth import Truth
     from pipeline.capture.loop import CaptureReport
 
@@ -35,32 +33,27 @@ def write_scan(world: World, capture: Path) -> None:
     """The nominal rig, its sensor, the scanned mesh: what the pipeline is told beside the images and their plan."""
     from disco_twin.camera.lars3 import lars3_sensor
 
-    _require_equal_sizes(world.scene.rig.cameras, "rig.cameras")
-    require_views_in_sight(world.scene.relight.views, world.scan)
-    world.plan  # noqa: B018 - refuses a rig that cannot capture this object before anything is simulated
+    require_capturable(world)
     write_atomically(capture / "scan.ply", bytes(world.scan.export(file_type="ply")))
     told = world.scene.rig.model_copy(update={"faults": FaultsConfig()})  # which faults are on is the twin's secret
-    write_atomically(capture / "rig.json", told.model_dump_json(indent=1).encode())
-    sensor = asdict(lars3_sensor(world.scene.rig))
-    write_atomically(capture / "sensor.json", json.dumps(sensor, indent=1).encode())
+    sensor = SensorFile(sensor=lars3_sensor(world.scene.rig))
+    write_atomically(capture / "rig.json", RigFile(rig=told).model_dump_json(indent=1).encode())
+    write_atomically(capture / "sensor.json", sensor.model_dump_json(indent=1).encode())
+
+
+def require_capturable(world: World) -> None:
+    """Refuse a scene whose devices do not reach the object, before anything is simulated."""
+    _require_equal_sizes(world.scene.rig.cameras, "rig.cameras")
+    for i, view in enumerate(world.scene.relight.views):
+        require_in_sight(view, world.scan, f"relight.views[{i}]", f"the held-out view {view.name!r}")
+    world.plan  # noqa: B018 - the plan refuses cameras, projector and spots that cannot be
 
 
 def _require_equal_sizes(cameras: Sequence[CameraConfig], key: str) -> None:
     sizes = {(c.width, c.height) for c in cameras}
     if len(sizes) > 1:
-        raise InputError("the twin's cameras must have one image size", key=key, value=sorted(sizes))
-
-
-def require_views_in_sight(views: Sequence[CameraConfig], mesh: trimesh.Trimesh) -> None:
-    """Every held-out view must see something of the object, or there is nothing to score."""
-    for i, view in enumerate(views):
-        if not sees(view, 0.0, mesh):
-            raise InputError(
-                f"the held-out view {view.name!r} does not see the object",
-                key=f"relight.views[{i}]",
-                value=view.aim_mm,
-                remedy="point its aim_mm at the object, or check position_mm and focal_length_mm",
-            )
+        remedy = "give all of them one width and height"
+        raise InputError("the twin's cameras must have one image size", key=key, value=sorted(sizes), remedy=remedy)
 
 
 def take_images(world: World, folder: RunFolder, progress: Progress) -> CaptureReport:
@@ -125,6 +118,8 @@ def render_references(world: World, shipped: Path, own: Path, progress: Progress
 
     scene, rendered = world.scene, 0
     lights, walks = scene.relight.lights, scene.simulation.reference_walks
+    if own.exists() and not own.is_dir():
+        raise InputError("is not a folder", file=own, remedy="choose another --out")
     own.mkdir(parents=True, exist_ok=True)
 
     def usable(path: Path, key: str) -> bool:

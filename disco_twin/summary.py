@@ -11,6 +11,7 @@ from disco_twin.folder import RunFolder, write_atomically
 from disco_twin.scene import Scene
 from hw.errors import InputError
 from pipeline.capture.stream import StreamReader
+from pipeline.config import read_json
 
 FORMAT_VERSION = 1
 
@@ -59,10 +60,10 @@ def write_summary(summary: dict[str, Any], path: Path) -> None:
 
 def load_summary(path: Path) -> dict[str, Any]:
     """Read a summary of this format."""
-    try:
-        data: dict[str, Any] = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(f"is no readable summary ({error})", file=path, remedy="disco-twin run") from error
+    data = read_json(path, dict[str, Any], "disco-twin score writes it anew")
     if data.get("format_version") != FORMAT_VERSION:
-        raise InputError("unknown format_version", file=path, allowed=str(FORMAT_VERSION), remedy="disco-twin score")
+        raise InputError(
+            "another format", file=path, key="format_version", value=data.get("format_version"),
+            allowed=str(FORMAT_VERSION), remedy="disco-twin score writes it anew",
+        )  # fmt: skip
     return data

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -25,9 +28,17 @@ class InputError(DiscoError):
         self.problem, self.file, self.key, self.value = problem, file, key, value
         self.allowed, self.remedy = allowed, remedy
         where = "" if file is None else f"{file}: "
-        what = "" if key is None else (f"{key}: " if value is None else f"{key} = {value!r}: ")
+        what = "" if key is None else (f"{key}: " if value is None else f"{key} = {_shown(value)}: ")
         tail = ("" if allowed is None else f" (allowed: {allowed})") + ("" if remedy is None else f". Remedy: {remedy}")
         super().__init__(f"{where}{what}{problem}{tail}")
+
+    def within(self, file: str | Path) -> InputError:
+        """The same error, known to come from `file`, unless it names a file already."""
+        if self.file is not None:
+            return self
+        return InputError(
+            self.problem, file=file, key=self.key, value=self.value, allowed=self.allowed, remedy=self.remedy
+        )
 
 
 class Refused(DiscoError):
@@ -65,3 +76,34 @@ class DeviceRefused(DeviceError):
 
 class DeviceFault(DeviceError):
     """The device reports a fault of its own: interlock, stall, over-temperature, a lost reference."""
+
+
+@contextmanager
+def naming(file: str | Path) -> Iterator[None]:
+    """Errors about a key that leave this block name the file that the key stands in."""
+    try:
+        yield
+    except InputError as error:
+        raise error.within(file) from error.__cause__
+
+
+def refused_by_the_disk(error: OSError, folder: Path) -> DiscoError | None:
+    """A full or write-protected disk as an error for the user; None for any other reason.
+
+    NumPy reports a full disk without an error number ("16 requested and 0 written").
+    """
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or "requested and" in str(error)
+    if not full and error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return None
+    why = "the disk is full" if full else (error.strerror or str(error)).lower()
+    remedy = "make room" if full else "choose another --out"
+    return DiscoError(f"{error.filename or folder}: {why}. Remedy: {remedy}, repeat the same command")
+
+
+def _shown(value: object) -> str:
+    """A value as TOML writes it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_shown, value))}]"
+    return repr(value)

@@ -3,20 +3,55 @@
 from __future__ import annotations
 
 import difflib
+import json
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, ValidationInfo
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
 
 from hw.errors import InputError
 
 
 class Strict(BaseModel):
-    """Base of every schema: unknown keys are refused, values are immutable."""
+    """Base of every schema: unknown keys are refused, values are immutable, `true` is no number and "3" neither."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _arrays(cls, data: Any) -> Any:
+        """TOML's arrays are lists, ours are tuples."""
+        if not isinstance(data, dict):
+            return data
+        version = data.get("format_version", 1)
+        if type(version) is not int:  # Python's True and 1.0 equal 1
+            data = data | {"format_version": str(version)}
+        return {key: _tuples(value) for key, value in data.items()}
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list | tuple) else value
+
+
+T = TypeVar("T")
+
+
+def as_table(kind: type[Any]) -> BeforeValidator:
+    """Annotation of a field that is a standard dataclass: it may be given as a table of its fields."""
+    adapter = TypeAdapter(kind)
+    return BeforeValidator(lambda data: adapter.validate_python(data) if isinstance(data, dict) else data)
 
 
 M = TypeVar("M", bound=Strict)
@@ -30,7 +65,7 @@ def _resolve(path: Path, info: ValidationInfo) -> Path:
     return full.resolve()
 
 
-NearbyFile = Annotated[Path, AfterValidator(_resolve)]
+NearbyFile = Annotated[Path, Field(strict=False), AfterValidator(_resolve)]
 """A file that must exist; relative names are relative to the folder of the TOML file that names it."""
 
 
@@ -44,12 +79,39 @@ def load_toml(path: str | Path, schema: type[M]) -> M:
         remedy = f"did you mean {path.parent / near[0]}?" if near else "give the path of a scene's TOML file"
         raise InputError("no such file", file=path, remedy=remedy) from None
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", file=path) from error
+        remedy = "give the path of a scene's TOML file"
+        raise InputError(f"cannot be read: {error.strerror}", file=path, remedy=remedy) from error
     except UnicodeDecodeError as error:
         raise InputError(f"is not UTF-8 text (byte {error.start})", file=path, remedy="save it as UTF-8") from error
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"is not valid TOML: {error}", file=path) from error
+        remedy = "mend that line; texts stand in quotes, a table's name in brackets"
+        raise InputError(f"is not valid TOML: {error}", file=path, remedy=remedy) from error
+    except RecursionError as error:
+        raise InputError("is nested too deeply", file=path, remedy="mend the brackets") from error
     return check(data, schema, path)
+
+
+def read_json(path: Path, schema: type[T], remedy: str) -> T:
+    """Read and validate a JSON file that a program wrote; any failure, another format version too, is one line."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        return TypeAdapter(schema).validate_python(data)
+    except FileNotFoundError as error:
+        raise InputError("is missing", file=path, remedy=remedy.removeprefix("delete it, then ")) from error
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", file=path, remedy=remedy) from error
+    except ValidationError as error:
+        first = min(error.errors(), key=lambda e: e["loc"][:1] != ("format_version",))
+        key = ".".join(str(part) for part in first["loc"]) or None
+        value = first["input"] if isinstance(first["input"], str | int | float) else None
+        if key == "format_version":
+            allowed = str(first.get("ctx", {}).get("expected", "")) or None
+            problem = "another format"
+            raise InputError(problem, file=path, key=key, value=value, allowed=allowed, remedy=remedy) from error
+        message = f"is damaged ({first['msg'].removeprefix('Value error, ')})"
+        raise InputError(message, file=path, key=key, value=value, remedy=remedy) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError("is damaged (it is no JSON)", file=path, remedy=remedy) from error
 
 
 def check(data: dict[str, Any], schema: type[M], path: str | Path) -> M:
@@ -71,18 +133,22 @@ def _one_line(error: ValidationError, data: dict[str, Any], schema: type[Strict]
         remedy = _nearest(str(name), node.get("properties", {}))
         return InputError("unknown key", file=path, key=_dotted(location, data), remedy=remedy)
     if kind == "missing":
-        return InputError("required key is missing", file=path, key=key)
+        if location and isinstance(location[-1], int):
+            key, _, _ = key.rpartition("[")
+            return InputError(f"has {location[-1]} values", file=path, key=key, remedy="give one more")
+        return InputError("required key is missing", file=path, key=key, remedy="add it")
     if kind == "union_tag_not_found":
         node = _node(schema.model_json_schema(), location)
         tags = ", ".join(node.get("discriminator", {}).get("mapping", {}))
-        return InputError("required key is missing", file=path, key=f"{key}.kind", allowed=tags or None)
+        remedy = "add it"
+        return InputError("required key is missing", file=path, key=f"{key}.kind", allowed=tags or None, remedy=remedy)
     if kind == "union_tag_invalid":
         tag, tags = context["tag"], context["expected_tags"].replace("'", "")
         remedy = _nearest(tag, tags.split(", "))
         return InputError("unknown kind", file=path, key=f"{key}.kind", value=tag, allowed=tags, remedy=remedy)
     value = problem["input"] if isinstance(problem["input"], str | int | float | bool | list | tuple) else None
     allowed = _allowed(_node(schema.model_json_schema(), location))
-    message = problem["msg"].removeprefix("Value error, ")
+    message = problem["msg"].removeprefix("Value error, ").replace("a valid tuple", "an array")
     return InputError(message[0].lower() + message[1:], file=path, key=key or None, value=value, allowed=allowed)
 
 

@@ -6,14 +6,18 @@ The pipeline is told this nominal rig and nothing else; the twin perturbs it (th
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from pipeline.config import Strict
+from pipeline.lens import covers_image
 
-Point = tuple[float, float, float]
-Positive = Annotated[float, Field(gt=0)]
+Length = Annotated[float, Field(ge=-1e6, le=1e6)]
+Point = tuple[Length, Length, Length]
+Positive = Annotated[float, Field(gt=0, le=1e9)]
+Angle = Annotated[float, Field(ge=-360, le=360)]
 
 
 class LaserConfig(Strict):
@@ -32,6 +36,8 @@ class Aimed(Strict):
 
     @model_validator(mode="after")
     def _looks_somewhere(self) -> Self:
+        if math.hypot(*self.up) < 1e-9:
+            raise ValueError("up is the zero vector: give a direction, such as [0.0, 0.0, 1.0]")
         if self.position_mm == self.aim_mm:
             raise ValueError("position_mm equals aim_mm: aim at another point than the device's own place")
         return self
@@ -57,6 +63,16 @@ class CameraConfig(Aimed):
     focal_length_mm: Positive = 25.0
     pixel_pitch_um: Positive = 11.0
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _undistortable(self) -> Self:
+        pixel = self.pixel_pitch_um * 1e-3 / self.focal_length_mm
+        if not covers_image(self.distortion, self.width / 2 * pixel, self.height / 2 * pixel):
+            raise ValueError(
+                f"distortion = {list(self.distortion)} cannot be undone: before the image's edge the picture folds "
+                "over. Give k1 k2 p1 p2 k3 with r (1 + k1 r^2 + k2 r^4 + k3 r^6) rising over the image"
+            )
+        return self
 
 
 class SensorConfig(Strict):
@@ -93,7 +109,7 @@ class RigConfig(Strict):
     projector: ProjectorConfig = ProjectorConfig()
     cameras: Annotated[tuple[CameraConfig, ...], Field(min_length=1, max_length=32)]
     sensor: SensorConfig = SensorConfig()
-    turntable_angles_deg: Annotated[tuple[float, ...], Field(min_length=1, max_length=72)] = (0.0,)
+    turntable_angles_deg: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=72)] = (0.0,)
     spots: Annotated[int, Field(ge=1, le=200_000)] = 300  # over all turntable angles
     max_incidence_deg: Annotated[float, Field(gt=0, le=89)] = 60.0
     faults: FaultsConfig = FaultsConfig()

@@ -14,39 +14,40 @@ import json
 import logging
 import os
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field
 
-from hw.errors import DiscoError, InputError
-from hw.record import Sensor
+from hw.errors import DiscoError, InputError, refused_by_the_disk
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
 from pipeline.calibrate.camera import PinholeCamera
 from pipeline.calibrate.fresnel import Boundary
 from pipeline.capture.stream import StreamReader
-from pipeline.config import Strict
+from pipeline.config import Strict, read_json
 from pipeline.reconstruct.methods import METHODS, READINGS, reconstruct
 from pipeline.reconstruct.model import ReflectanceModel
 from pipeline.reconstruct.needs import omissions
 from pipeline.reconstruct.samples import Samples, SampleStatistics, take_samples
 from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.reconstruct.views import Reading
+from pipeline.records import RigFile, SensorFile
 from pipeline.relight.irradiance import transmitted_flux
 from pipeline.relight.lights import Light
 from pipeline.relight.relight import ViewMatrix, view_matrix
 from pipeline.resources import measured
-from pipeline.rig import CameraConfig, RigConfig
+from pipeline.rig import CameraConfig
 
 FORMAT_VERSION = 1
-T = TypeVar("T")
+CAPTURE_AGAIN = "delete it, then repeat the capture command"
 
 log = logging.getLogger(__name__)
 
@@ -81,26 +82,17 @@ class Stages:
         log.info("%s: %.1f s", name, self.rows[-1]["seconds"])
 
 
-def read_json(path: Path, schema: type[T], remedy: str) -> T:
-    """Validate a JSON file; any failure is one line."""
-    try:
-        return TypeAdapter(schema).validate_json(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", file=path, remedy=remedy) from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"]) or None
-        raise InputError(first["msg"], file=path, key=key, remedy=remedy) from error
-
-
 def read_scan(path: Path) -> trimesh.Trimesh:
     """The scanned mesh in mm, vertices as they are numbered in the file."""
     try:
         mesh = trimesh.load(path, process=False)
-    except (OSError, ValueError, IndexError, KeyError) as error:
-        raise InputError(f"not a readable mesh ({error})", file=path, remedy="scan again") from error
+    except Exception as error:  # the loaders raise whatever their parsing trips over
+        why = f" ({error.strerror})" if isinstance(error, OSError) and error.strerror else ""
+        raise InputError(f"not a readable mesh{why}", file=path, remedy=CAPTURE_AGAIN) from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise InputError("holds no triangles", file=path, remedy="scan again")
+        raise InputError("holds no triangles", file=path, remedy=CAPTURE_AGAIN)
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices) or not np.isfinite(mesh.vertices).all():
+        raise InputError("the scan's triangles and vertices do not fit", file=path, remedy=CAPTURE_AGAIN)
     if not mesh.is_watertight or mesh.volume <= 0:
         raise InputError("the scan is open or inside out", file=path, remedy="close it and orient its faces outward")
     return mesh
@@ -178,8 +170,8 @@ def run(capture: Path, work: Path, request: Request) -> dict[str, Any]:
     stages, settings = Stages(), request.reconstruct
     work.mkdir(parents=True, exist_ok=True)
     with stages.stage("calibration"):
-        rig = read_json(capture / "rig.json", RigConfig, "repeat the capture command")
-        sensor = read_json(capture / "sensor.json", Sensor, "repeat the capture command")
+        rig = read_json(capture / "rig.json", RigFile, CAPTURE_AGAIN).rig
+        sensor = read_json(capture / "sensor.json", SensorFile, CAPTURE_AGAIN).sensor
         mesh = read_scan(capture / "scan.ply")
         calibration = nominal_calibration(rig, sensor)
         calibration.save(work / "calibration.json")
@@ -230,7 +222,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("capture", type=Path, help="folder with rig.json, sensor.json, scan.ply and the stream")
     parser.add_argument("work", type=Path, help="folder to write into")
     parser.add_argument("--request", type=Path, required=True, help="JSON: reconstruct, relight")
+    parser.add_argument("--until-stdin-closes", action="store_true", help="end at once when the starting process ends")
     options = parser.parse_args(arguments)
+    if options.until_stdin_closes:
+        threading.Thread(target=_end_with_stdin, daemon=True).start()
     logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(levelname)s %(name)s: %(message)s")
     try:
         request = read_json(options.request, Request, "write it as docs/conventions.md says")
@@ -238,4 +233,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except DiscoError as error:
         sys.stderr.write(f"{error}\n")
         return 2
+    except OSError as error:
+        known = refused_by_the_disk(error, options.work)
+        if known is None:
+            raise
+        sys.stderr.write(f"{known}\n")
+        return 2
+    except MemoryError:
+        sys.stderr.write(f"{options.capture}: not enough memory. Remedy: a scan of fewer vertices, or fewer methods\n")
+        return 2
     return 0
+
+
+def _end_with_stdin() -> None:
+    """A process that was killed cannot stop the one it started: an orphan would write into the folder of the next."""
+    while os.read(0, 1):  # not sys.stdin, whose lock a thread may not hold when Python ends
+        pass
+    os._exit(1)

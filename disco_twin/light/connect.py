@@ -108,9 +108,7 @@ def straight_transmittance(t: Tables, origin: Any, target: Any, rng: Rng) -> tup
     p = mi.Point3f(origin)
     going = mi.Bool(True)
     while dr.hint(going, label="straight"):
-        hit = t.scene.ray_intersect(
-            mi.Ray3f(p, direction, FAR, 0.0, mi.Color0f()), mi.RayFlags.Minimal, False, True
-        )
+        hit = t.scene.ray_intersect(mi.Ray3f(p, direction, FAR, 0.0, mi.Color0f()), mi.RayFlags.Minimal, False, True)
         going = hit.is_valid()
         if dr.hint(going & inside):
             passed, rng = transmittance(t, p, direction, hit.t, rng)
@@ -166,9 +164,7 @@ def connect_lobes(
                             passed, rng = transmittance(t, point, omega, hit.t, rng)
                             value *= passed
                             start = mi.Point3f(hit.p + hit.n * t.lift)
-                            blocked = t.scene.ray_test(
-                                mi.Ray3f(start, towards, FAR, 0.0, mi.Color0f()), False, True
-                            )
+                            blocked = t.scene.ray_test(mi.Ray3f(start, towards, FAR, 0.0, mi.Color0f()), False, True)
                             splat(
                                 images.lobes, images.lobes_squared, images, base + pixel, pixels,
                                 weight * value, t.lasers, rng, ~blocked,
@@ -204,8 +200,6 @@ def connect_exit(
                 if dr.hint(images.layers == 2, mode="scalar"):
                     layer = dr.select(surface_only, mi.UInt32(1), mi.UInt32(0))
                 base = ((tag * images.layers + layer) * cams.count + camera) * (t.lasers * pixels) + pixel
-                splat(
-                    images.exits, images.exits_squared, images, base, pixels, weight * value, t.lasers, rng, ~blocked
-                )
+                splat(images.exits, images.exits_squared, images, base, pixels, weight * value, t.lasers, rng, ~blocked)
         camera += 1
     return rng

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 F32 = NDArray[np.float32]
 
 FORMAT_VERSION = 1
+RENDER_AGAIN = "delete it, disco-twin run renders it again"
 LAYERS = ("subsurface", "surface")
 HALVES = ("A", "B")
 
@@ -87,14 +88,18 @@ def load_reference(path: Path) -> Reference:
     """Read what `save_reference` wrote."""
     import OpenEXR
 
+    if not path.is_file():
+        raise InputError("the reference is missing", file=path, remedy="disco-twin run renders it")
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             header, channels = dict(file.header()), {name: c.pixels for name, c in file.channels().items()}
     except (OSError, RuntimeError, ValueError) as error:
-        remedy = "delete it, it is rendered again"
-        raise InputError(f"not a readable EXR ({error})", file=path, remedy=remedy) from error
+        raise InputError("not a readable EXR", file=path, remedy=RENDER_AGAIN) from error
     if header.get("formatVersion") != FORMAT_VERSION:
-        raise InputError("not a reference of this format", file=path, remedy="delete it, it is rendered again")
+        raise InputError(
+            "another format", file=path, key="formatVersion", value=header.get("formatVersion"),
+            allowed=str(FORMAT_VERSION), remedy=RENDER_AGAIN,
+        )  # fmt: skip
     lasers = len(channels) // (len(HALVES) * len(LAYERS))
     halves = np.stack(
         [

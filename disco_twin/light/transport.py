@@ -182,9 +182,13 @@ class Transport:
     ) -> Traced:  # fmt: skip
         tables = self._tables(group)
         table = camera_table(cameras) if cameras else None
-        per_tag = 8 * len(group) * (
-            (4 * layers * table.count * table.width * table.height if table else 0)
-            + (len(self.vertices) if deposit else 0)
+        per_tag = (
+            8
+            * len(group)
+            * (
+                (4 * layers * table.count * table.width * table.height if table else 0)
+                + (len(self.vertices) if deposit else 0)
+            )
         )
         batch = max(1, min(tags, ACCUMULATOR_BYTES // max(per_tag, 1), (1 << 31) // max(walks, 1)))
         names = mi.UInt32(streams)
@@ -253,9 +257,7 @@ def camera_table(cameras: Sequence[PinholeCamera]) -> kernel.Cameras:
     width, height = cameras[0].width, cameras[0].height
     if any((c.width, c.height) != (width, height) for c in cameras):
         raise ValueError("cameras traced together must have the same image size")
-    rows = [
-        np.concatenate([c.position, *c.pose[:3, :3], c.focal, c.centre, c.distortion]) for c in cameras
-    ]
+    rows = [np.concatenate([c.position, *c.pose[:3, :3], c.focal, c.centre, c.distortion]) for c in cameras]
     return kernel.Cameras(count=len(cameras), width=width, height=height, rows=to_float(np.stack(rows)))
 
 

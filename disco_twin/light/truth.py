@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,10 +61,14 @@ class Truth:
     def load(cls, path: Path) -> Truth:
         """Read what `save` wrote; a damaged file or another format version is refused."""
         try:
-            data = np.load(path, allow_pickle=False)
-        except (zipfile.BadZipFile, ValueError, EOFError) as error:
-            raise InputError("is damaged", file=path, remedy="disco-twin run computes it again") from error
-        with data:
+            with np.load(path, allow_pickle=False) as file:
+                data = {name: file[name] for name in file}
+        except FileNotFoundError as error:
+            raise InputError("is missing", file=path, remedy="disco-twin run computes it") from error
+        except (OSError, zipfile.BadZipFile, zlib.error, ValueError, EOFError, TypeError) as error:
+            remedy = "delete it, disco-twin run computes it again"
+            raise InputError("is damaged", file=path, remedy=remedy) from error
+        try:
             if int(data["format_version"]) != FORMAT_VERSION:
                 raise InputError(
                     "unknown format", file=path, key="format_version", value=int(data["format_version"]),
@@ -71,6 +76,9 @@ class Truth:
                 )  # fmt: skip
             balance = EnergyBalance(**{k: data[f"balance_{k}"] for k in EnergyBalance.__dataclass_fields__})
             return cls(data["columns"], data["mean"], data["standard_error"], data["area"], balance)
+        except KeyError as error:
+            remedy = "delete it, disco-twin run computes it again"
+            raise InputError(f"is damaged (it lacks {error})", file=path, remedy=remedy) from error
 
 
 def hat_areas(transport: Transport, basis: sparse.csr_matrix) -> F64:

@@ -9,9 +9,10 @@ import trimesh
 
 from disco_twin.object import shapes
 from disco_twin.object.media import Medium, build_medium
-from disco_twin.object.mesh import hat_basis, read_mesh, remesh
-from disco_twin.object.schema import Box, MeshFile, ObjectConfig, Pebble, Sphere
-from disco_twin.scene import Scene
+from disco_twin.object.mesh import check_size, hat_basis, read_mesh, remesh
+from disco_twin.object.schema import Box, MeshFile, ObjectConfig, Pebble, Sphere, Torus
+from disco_twin.scene import MOST_VERTICES, Scene
+from hw.errors import InputError
 
 __all__ = ["Boundary", "Medium", "TwinObject", "build_object", "build_scan", "hat_basis"]
 
@@ -50,6 +51,14 @@ def build_scan(scene: Scene, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The mesh that the pipeline is given: `mesh` itself, or one of about `scan.vertices` vertices."""
     vertices, shape = scene.scan.vertices, scene.object.shape
     if vertices is None:
+        if len(mesh.vertices) > MOST_VERTICES:
+            raise InputError(
+                f"left out, the scan is the object's own mesh of {len(mesh.vertices)} vertices, and R_d holds the "
+                "square of that for every laser",
+                key="scan.vertices",
+                allowed=f"at most {MOST_VERTICES}",
+                remedy="set scan.vertices",
+            )
         return mesh
     if isinstance(shape, Box):
         return shapes.box(shape, triangles=2 * vertices)  # keeps the edges sharp
@@ -60,6 +69,12 @@ def _mesh(config: ObjectConfig) -> trimesh.Trimesh:
     shape = config.shape
     if isinstance(shape, MeshFile):
         return read_mesh(shape.file)
+    mesh = _procedural(shape)
+    check_size(mesh, "object.shape")
+    return mesh
+
+
+def _procedural(shape: Pebble | Sphere | Box | Torus) -> trimesh.Trimesh:
     if isinstance(shape, Pebble):
         return shapes.pebble(shape)
     if isinstance(shape, Sphere):

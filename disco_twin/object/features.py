@@ -9,8 +9,10 @@ from scipy.spatial import cKDTree
 
 from disco_twin.object.mesh import closest, depth
 from disco_twin.object.schema import Crack, Feature, HollowCore, Layers, Patch, Veins
+from hw.errors import InputError
 
 F64 = NDArray[np.float64]
+MOST_VEINS = 1e6
 
 
 def coverage(feature: Feature, points: F64, cell: float, mesh: trimesh.Trimesh) -> F64:
@@ -49,8 +51,12 @@ def _foam(feature: Veins, points: F64, mesh: trimesh.Trimesh) -> F64:
     """(N,) distance to the walls between warped Voronoi cells of about `spacing_mm`^3 each."""
     random = np.random.default_rng(feature.seed)
     low, high = mesh.bounds[0] - feature.spacing_mm, mesh.bounds[1] + feature.spacing_mm
-    count = int(np.ceil(np.prod((high - low) / feature.spacing_mm)))
-    sites = random.uniform(low, high, size=(count, 3))
+    count = np.ceil(np.prod((high - low) / feature.spacing_mm))
+    if count > MOST_VEINS:
+        problem = f"there would be {count:.3g} cells between the veins"
+        key, most = "object.medium.features.spacing_mm", f"at most {MOST_VEINS:.0e} cells"
+        raise InputError(problem, key=key, value=feature.spacing_mm, allowed=most, remedy="a larger spacing_mm")
+    sites = random.uniform(low, high, size=(int(count), 3))
     warped = points + 0.2 * feature.spacing_mm * _waves(points, feature.spacing_mm, random)
     index: NDArray[np.int64] = np.asarray(cKDTree(sites).query(warped, k=2)[1])
     nearest, other = sites[index[:, 0]], sites[index[:, 1]]

@@ -67,14 +67,19 @@ def _grid(base: Grid, mesh: trimesh.Trimesh, lasers: int, g: tuple[float, ...]) 
         albedo = read_voxels(base.albedo_file, lasers, f"{key}.albedo_file", highest=1.0).values
         if albedo.shape[1:] != density.values.shape[1:]:
             problem = f"the albedo grid is {albedo.shape[1:]}, sigma_t is {density.values.shape[1:]} (nz, ny, nx)"
-            raise InputError(problem, file=base.albedo_file, key=f"{key}.albedo_file")
+            remedy = "give both grids the same voxels"
+            raise InputError(problem, file=base.albedo_file, key=f"{key}.albedo_file", remedy=remedy)
     else:
         assert base.albedo is not None  # the schema asks for exactly one of the two
         albedo = _column(_per_wavelength(base.albedo, lasers))
     low = density.low if base.low_mm is None else np.array(base.low_mm)
     high = density.high if base.high_mm is None else np.array(base.high_mm)
     if low is None or high is None:
-        raise InputError("required for a .npy grid: its x, y, z corners in mm", key=f"{key}.low_mm and high_mm")
+        problem = "required for a .npy grid: its x, y, z corners in mm"
+        raise InputError(problem, key=f"{key}.low_mm and high_mm", remedy="add both")
+    if not (low < high).all():
+        problem, remedy = f"the grid's corners are {_mm(low)} and {_mm(high)} mm", "exchange low_mm and high_mm"
+        raise InputError(problem, file=base.sigma_t_file, key=key, allowed="low_mm < high_mm", remedy=remedy)
     tolerance = 1e-6 * mesh.extents
     if (mesh.bounds[0] < low - tolerance).any() or (mesh.bounds[1] > high + tolerance).any():
         problem = f"the grid from {_mm(low)} to {_mm(high)} mm does not cover the object"

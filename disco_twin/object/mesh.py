@@ -10,6 +10,7 @@ import scipy.sparse
 import trimesh
 from numpy.typing import NDArray
 
+from disco_twin.object.shells import check_shells
 from hw.errors import InputError
 
 F64 = NDArray[np.float64]
@@ -17,24 +18,27 @@ KEY = "object.shape.file"
 
 
 LARGEST_MM, SMALLEST_MM = 2000.0, 1.0  # extents that a rig of about 500 mm working distance can mean
+THINNEST = 1e-3  # of its largest extent: light is traced in single precision
 FINE_TRIANGLES = 20_000  # truth is tallied on the mesh's vertices: triangles are cut in four until there are so many
 
 
 def read_mesh(path: Path) -> trimesh.Trimesh:
     """A closed, outward oriented mesh in mm from a PLY, OBJ or STL file; anything else is refused with its reason."""
     if path.suffix.lower() not in (".ply", ".obj", ".stl"):
-        raise InputError("unknown type of mesh file", file=path, key=KEY, allowed=".ply, .obj, .stl")
+        raise InputError("unknown type of mesh file", file=path, key=KEY, allowed=".ply, .obj, .stl", remedy=_EXPORT)
     try:
         loaded = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # the loaders raise whatever their parsing trips over
-        raise InputError(f"cannot be read as a mesh: {error}", file=path, key=KEY) from error
+        why = f": {error.strerror}" if isinstance(error, OSError) and error.strerror else ""
+        problem = f"cannot be read as a {path.suffix[1:].upper()} mesh{why}"
+        raise InputError(problem, file=path, key=KEY, remedy=_EXPORT) from error
     faces = np.asarray(getattr(loaded, "faces", ()), dtype=np.int64).reshape(-1, 3)
     if len(faces) == 0:
-        raise InputError("the mesh is empty (no triangles)", file=path, key=KEY)
+        raise InputError("the mesh is empty (no triangles)", file=path, key=KEY, remedy=_EXPORT)
     if faces.min() < 0 or faces.max() >= len(loaded.vertices):
-        raise InputError("a triangle names a vertex that does not exist", file=path, key=KEY)
+        raise InputError("a triangle names a vertex that does not exist", file=path, key=KEY, remedy=_EXPORT)
     if not np.isfinite(np.asarray(loaded.vertices)[faces]).all():
-        raise InputError("a vertex is not a finite number", file=path, key=KEY)
+        raise InputError("a vertex is not a finite number", file=path, key=KEY, remedy=_EXPORT)
     # Vertices that files repeat per triangle (STL) or per texture seam (OBJ) are one vertex; slivers without area go.
     mesh = trimesh.Trimesh(np.array(loaded.vertices), faces, process=False)
     mesh.merge_vertices()
@@ -49,25 +53,35 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
 def check_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
     """Refuse a mesh that light cannot be traced in, or that was not meant in mm."""
     if len(mesh.faces) == 0:
-        raise InputError("the mesh is empty (all its triangles are degenerate)", file=path, key=KEY)
-    size = float(mesh.extents.max())
-    if size < SMALLEST_MM:
-        remedy = "scale it by 1000 if it is in metres"
-        raise InputError(f"the mesh is {size:.3g} mm large", file=path, key=KEY, allowed=_SIZES, remedy=remedy)
-    if size > LARGEST_MM:
-        remedy = "scale it by 0.001 if it is in micrometres"
-        raise InputError(f"the mesh is {size:.3g} mm large", file=path, key=KEY, allowed=_SIZES, remedy=remedy)
+        problem = "the mesh is empty (all its triangles are degenerate)"
+        raise InputError(problem, file=path, key=KEY, remedy=_EXPORT)
+    check_size(mesh, KEY, path)
     if not mesh.is_watertight:
         _, count = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
         problem = f"the mesh is not closed ({(count != 2).sum()} of {len(count)} edges do not join two triangles)"
         raise InputError(problem, file=path, key=KEY, remedy="fill its holes")
     if not mesh.is_winding_consistent:
         raise InputError("the mesh's triangles are not all oriented the same way", file=path, key=KEY, remedy=_FLIP)
-    if mesh.volume <= 0:
-        raise InputError("the mesh is inside out", file=path, key=KEY, remedy=_FLIP)
+    check_shells(mesh, path, KEY, _FLIP)
+
+
+def check_size(mesh: trimesh.Trimesh, key: str, path: Path | None = None) -> None:
+    """Refuse what no rig of about 500 mm working distance can scan, and plates too thin for single precision."""
+    size, thinnest = float(mesh.extents.max()), float(mesh.extents.min())
+    remedy = None
+    if size < SMALLEST_MM:
+        remedy = "scale it by 1000 if it is in metres"
+    elif not size <= LARGEST_MM:
+        remedy = "scale it by 0.001 if it is in micrometres"
+    if remedy:
+        raise InputError(f"the object is {size:.3g} mm large", file=path, key=key, allowed=_SIZES, remedy=remedy)
+    if not thinnest >= size * THINNEST:
+        problem = f"the object is {size:.3g} mm large and {thinnest:.3g} mm thin"
+        raise InputError(problem, file=path, key=key, allowed=f"thickness >= {THINNEST:g} of it", remedy="thicken it")
 
 
 _SIZES = f"{SMALLEST_MM:g} .. {LARGEST_MM:g} mm"
+_EXPORT = "export the mesh again as a binary PLY, closed and in mm"
 _FLIP = "recompute its normals outside"
 
 

@@ -30,21 +30,28 @@ def read_voxels(path: Path, lasers: int, key: str, highest: float = np.inf) -> V
     elif path.suffix == ".vol":
         voxels = _read_vol(path, key)
     else:
-        raise InputError("unknown type of grid file", file=path, key=key, allowed=".npy or .vol")
+        raise InputError("unknown type of grid file", file=path, key=key, allowed=".npy or .vol", remedy=_NPY)
     values = voxels.values
     if values.size == 0:
-        raise InputError("the grid is empty", file=path, key=key)
+        raise InputError("the grid is empty", file=path, key=key, remedy=_NPY)
     if len(values) not in (1, lasers):
         problem = f"the grid has {len(values)} wavelengths for {lasers} lasers"
         remedy = "store (nz, ny, nx) for all lasers, or (lasers, nz, ny, nx)"
         raise InputError(problem, file=path, key=key, remedy=remedy)
     for bad, what in ((~np.isfinite(values), "not a finite number"), (values < 0, "negative")):
         if bad.any():
-            raise InputError(f"{_first(bad)} is {what} ({bad.sum()} in all)", file=path, key=key, allowed=">= 0")
+            raise InputError(
+                f"{_first(bad)} is {what} ({bad.sum()} in all)", file=path, key=key, allowed=">= 0", remedy=_CELL
+            )
     if values.max() > highest:
         problem = f"{_first(values > highest)} is too large, the largest is {values.max():g}"
-        raise InputError(problem, file=path, key=key, allowed=f"0 .. {highest:g}")
+        raise InputError(problem, file=path, key=key, allowed=f"0 .. {highest:g}", remedy=_CELL)
     return voxels
+
+
+_NPY = "write it with numpy.save as float32 (nz, ny, nx)"
+_CELL = "mend these voxels, or fill them with their neighbours' mean"
+_VOL = "write it again, or give an .npy file with low_mm and high_mm"
 
 
 def _first(bad: NDArray[np.bool_]) -> str:
@@ -55,10 +62,13 @@ def _first(bad: NDArray[np.bool_]) -> str:
 def _read_npy(path: Path, key: str) -> Voxels:
     try:
         values = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise InputError(f"not a readable .npy file: {error}", file=path, key=key) from error
+    except (ValueError, EOFError, OSError, SyntaxError, MemoryError) as error:
+        why = f" ({error.strerror})" if isinstance(error, OSError) and error.strerror else ""
+        raise InputError(f"not a readable .npy file of numbers{why}", file=path, key=key, remedy=_NPY) from error
     if not isinstance(values, np.ndarray) or values.ndim not in (3, 4) or values.dtype.kind not in "fiu":
-        raise InputError("not an array of real numbers (nz, ny, nx) or (lasers, nz, ny, nx)", file=path, key=key)
+        raise InputError(
+            "not an array of real numbers (nz, ny, nx) or (lasers, nz, ny, nx)", file=path, key=key, remedy=_NPY
+        )
     values = values.astype(np.float32)
     return Voxels(values if values.ndim == 4 else values[None], None, None)
 
@@ -67,13 +77,18 @@ def _read_vol(path: Path, key: str) -> Voxels:
     """Mitsuba's grid volume, version 3: header of 48 bytes, then float32 with channels fastest, then x, y, z."""
     data = path.read_bytes()
     if len(data) < 48 or data[:3] != b"VOL" or data[3] != 3:
-        raise InputError("not a Mitsuba .vol file of version 3", file=path, key=key)
+        raise InputError("not a Mitsuba .vol file of version 3", file=path, key=key, remedy=_VOL)
     encoding, nx, ny, nz, channels = struct.unpack_from("<5i", data, 4)
     corners = np.array(struct.unpack_from("<6f", data, 24), dtype=float)
     if encoding != 1:
-        raise InputError(f"the .vol file's encoding is {encoding}", file=path, key=key, allowed="1 (float32)")
+        problem = f"the .vol file's encoding is {encoding}"
+        raise InputError(problem, file=path, key=key, allowed="1 (float32)", remedy=_VOL)
     count = nx * ny * nz * channels
     if min(nx, ny, nz, channels) < 1 or len(data) != 48 + 4 * count:
-        raise InputError(f"the .vol file has {len(data)} bytes, its header says {48 + 4 * count}", file=path, key=key)
+        problem = f"the .vol file has {len(data)} bytes, its header says {48 + 4 * count}"
+        raise InputError(problem, file=path, key=key, remedy=_VOL)
+    if not (np.isfinite(corners).all() and (corners[:3] < corners[3:]).all()):
+        problem = f"the .vol file's corners are {corners[:3].tolist()} and {corners[3:].tolist()}"
+        raise InputError(problem, file=path, key=key, allowed="finite, the first below the second", remedy=_VOL)
     values = np.frombuffer(data, "<f4", count, 48).reshape(nz, ny, nx, channels)
     return Voxels(np.moveaxis(values, -1, 0).astype(np.float32), corners[:3], corners[3:])

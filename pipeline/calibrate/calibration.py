@@ -23,7 +23,7 @@ from hw.interface import Aim
 from hw.record import RadianceImage, RawImage, Sensor, to_radiance
 from pipeline.calibrate.camera import PinholeCamera, turn
 from pipeline.calibrate.projector import TwoMirrorProjector
-from pipeline.config import Strict, check
+from pipeline.config import Strict, as_table, check
 from pipeline.rig import RigConfig
 
 F64 = NDArray[np.float64]
@@ -77,7 +77,7 @@ class Calibration(Strict):
     views: Annotated[tuple[ViewCalibration, ...], Field(min_length=1)]
     projectors: Annotated[tuple[ProjectorCalibration, ...], Field(min_length=1)]  # one per turntable angle
     lasers: Annotated[tuple[LaserCalibration, ...], Field(min_length=1)]
-    sensor: Sensor
+    sensor: Annotated[Sensor, as_table(Sensor)]
     vignetting_exponent: float = 4.0
 
     @property

@@ -22,7 +22,8 @@ from pydantic import Field, ValidationError
 
 from hw.errors import InputError
 from hw.interface import Aim
-from pipeline.capture.sweep import choose_spots, require_in_sight
+from pipeline.capture.sight import require_rig_in_sight
+from pipeline.capture.sweep import choose_spots
 from pipeline.config import Strict
 from pipeline.rig import RigConfig
 
@@ -151,10 +152,13 @@ def load_plan(path: Path) -> Plan:
     try:
         text = path.read_text(encoding="utf-8")
         version = json.loads(text).get("format_version")
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, AttributeError) as error:
+    except (OSError, ValueError, AttributeError, RecursionError) as error:
         raise InputError(f"not a readable plan ({error})", file=path, remedy="repeat the capture command") from error
     if version != FORMAT_VERSION:
-        raise InputError("another version's plan", file=path, key="format_version", value=version, allowed="1")
+        raise InputError(
+            "another version's plan", file=path, key="format_version", value=version,
+            allowed=str(FORMAT_VERSION), remedy="capture into another folder",
+        )  # fmt: skip
     try:
         file = _PlanFile.model_validate_json(text)
         return Plan(file.cameras, file.angles_rad, tuple(Aim(*spot) for spot in file.spots), file.lasers)
@@ -168,6 +172,6 @@ def make_plan(rig: RigConfig, mesh: trimesh.Trimesh) -> Plan:
 
     Refuses a rig whose cameras do not see the object or whose laser does not reach it in enough places.
     """
-    require_in_sight(rig, mesh)
+    require_rig_in_sight(rig, mesh)
     angles = tuple(float(a) for a in np.deg2rad(rig.turntable_angles_deg))
     return Plan(tuple(c.name for c in rig.cameras), angles, choose_spots(rig, mesh), len(rig.lasers))

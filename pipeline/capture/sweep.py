@@ -17,9 +17,9 @@ from scipy.spatial import cKDTree
 
 from hw.errors import InputError
 from hw.interface import Aim
-from pipeline.calibrate.camera import PinholeCamera, turn
+from pipeline.calibrate.camera import turn
 from pipeline.calibrate.projector import TwoMirrorProjector
-from pipeline.rig import CameraConfig, RigConfig
+from pipeline.rig import RigConfig
 
 if TYPE_CHECKING:
     import trimesh
@@ -122,28 +122,3 @@ def farthest_points(points: F64, cosine: F64, count: int) -> NDArray[np.int64]:
         # No point is farther from the chosen ones than this: score >= cosine * distance^2 for every point.
         reach = float(np.sqrt(max(squared.max(), 0.0))) * (1 + 1e-9)
     return chosen
-
-
-def require_in_sight(rig: RigConfig, mesh: trimesh.Trimesh) -> None:
-    """Every camera must see something of the object at every turntable angle."""
-    for config in rig.cameras:
-        for degrees in rig.turntable_angles_deg:
-            if not sees(config, np.deg2rad(degrees), mesh):
-                raise InputError(
-                    f"the camera does not see the object at turntable angle {degrees:g} deg",
-                    key=f"rig.cameras.{config.name}.aim_mm",
-                    value=config.aim_mm,
-                    remedy="aim it at the object, or check position_mm and focal_length_mm",
-                )
-
-
-def sees(config: CameraConfig, angle_rad: float, mesh: trimesh.Trimesh) -> bool:
-    """Whether a camera has something of the object in its image at a turntable angle."""
-    camera = PinholeCamera.from_config(config).seen_from(turn(angle_rad))
-    pixel, depth = camera.project(np.asarray(mesh.vertices, float))
-    inside = ((pixel > 0) & (pixel < [camera.width, camera.height])).all(axis=1)
-    if bool((inside & (depth > 0)).any()):
-        return True
-    # A coarse mesh can fill the image without a vertex in it.
-    grid = np.stack(np.meshgrid(np.linspace(0, camera.width, 25), np.linspace(0, camera.height, 25)), axis=-1)
-    return bool(mesh.ray.intersects_any(*camera.rays(grid.reshape(-1, 2))).any())

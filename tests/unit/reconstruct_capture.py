@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-from json import dumps
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +13,7 @@ from pipeline.calibrate.fresnel import transmittance
 from pipeline.capture.plan import ImageAddress, Plan, make_plan
 from pipeline.capture.stream import ImageMeta, StreamWriter
 from pipeline.reconstruct.mesh import first_hit
+from pipeline.records import RigFile, SensorFile
 from pipeline.rig import CameraConfig, LaserConfig, ProjectorConfig, RigConfig, SensorConfig
 
 RADIUS = 15.0
@@ -91,7 +90,7 @@ def write_capture(folder: Path, subdivisions: int = 2) -> trimesh.Trimesh:
             meta = ImageMeta(n / 15, power, angle, aim.u if aim else -1, aim.v if aim else -1)
             stream.append(address, raw, meta)
     mesh.export(folder / "scan.ply")
-    (folder / "rig.json").write_text(config.model_dump_json())
-    (folder / "sensor.json").write_text(dumps(asdict(SENSOR)))
+    (folder / "rig.json").write_text(RigFile(rig=config).model_dump_json())
+    (folder / "sensor.json").write_text(SensorFile(sensor=SENSOR).model_dump_json())
     assert (first_hit(mesh, *calibration.spot_rays(plan.spots)).triangle >= 0).all()
     return mesh

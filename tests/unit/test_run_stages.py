@@ -19,6 +19,7 @@ from disco_twin.deviation import actual_rig
 from disco_twin.folder import RunFolder, StageRecord
 from disco_twin.run import Run, capture_stages, drop_old_light, pipeline_stage, score_stages, truth_stages
 from disco_twin.world import World
+from pipeline.records import PipelineRecord
 
 
 class Scored(Exception):
@@ -49,7 +50,10 @@ def keys_of(folder: RunFolder, methods: tuple[str, ...] = ("default",)) -> dict[
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> RunFolder:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
+    done = PipelineRecord(stages=(), methods={}, capture={}, left_out=(), warnings=())
+    monkeypatch.setattr(stages, "load_results", lambda folder: done)
+    monkeypatch.setattr(stages, "stale", lambda *_: None)
     scene = tmp_path / "scene.toml"
     scene.write_text("")
     return RunFolder.claim(tmp_path / "out", scene, "one")

@@ -1,0 +1,57 @@
+"""The JSON files that hand something on between the twin and the pipeline, as schemas; all carry `format_version`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import ConfigDict
+
+from hw.record import Sensor
+from pipeline.config import Strict, as_table
+from pipeline.rig import RigConfig
+
+
+class RigFile(Strict):
+    """CAPTURE/rig.json: the nominal rig."""
+
+    format_version: Literal[1] = 1
+    rig: RigConfig
+
+
+class SensorFile(Strict):
+    """CAPTURE/sensor.json: what is known of the cameras' sensor."""
+
+    format_version: Literal[1] = 1
+    sensor: Annotated[Sensor, as_table(Sensor)]
+
+
+class Figures(Strict):
+    """A record that may hold more than its readers need."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
+class StageFigures(Figures):
+    """What a stage of the pipeline took."""
+
+    name: str
+    seconds: float
+    peak_mb: float
+
+
+class MethodFigures(Figures):
+    """What a method took, and how its model came about."""
+
+    seconds: float
+    provenance: dict[str, str]
+
+
+class PipelineRecord(Figures):
+    """WORK/pipeline.json: what the pipeline did, in the order of the work; `methods` by name."""
+
+    format_version: Literal[1] = 1
+    stages: tuple[StageFigures, ...]
+    methods: dict[str, MethodFigures]
+    capture: dict[str, Any]
+    left_out: tuple[dict[str, str], ...]
+    warnings: tuple[str, ...]
