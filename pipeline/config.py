@@ -149,7 +149,9 @@ def _one_line(error: ValidationError, data: dict[str, Any], schema: type[Strict]
     value = problem["input"] if isinstance(problem["input"], str | int | float | bool | list | tuple) else None
     allowed = _allowed(_node(schema.model_json_schema(), location))
     message = problem["msg"].removeprefix("Value error, ").replace("a valid tuple", "an array")
-    return InputError(message[0].lower() + message[1:], file=path, key=key or None, value=value, allowed=allowed)
+    if message.startswith("Input should"):
+        message = "i" + message[1:]
+    return InputError(message, file=path, key=key or None, value=value, allowed=allowed)
 
 
 def _rank(kind: str) -> int:

@@ -61,7 +61,7 @@ class Truth:
     def load(cls, path: Path) -> Truth:
         """Read what `save` wrote; a damaged file or another format version is refused."""
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with path.open("rb") as stored, np.load(stored, allow_pickle=False) as file:
                 data = {name: file[name] for name in file}
         except FileNotFoundError as error:
             raise InputError("is missing", file=path, remedy="disco-twin run computes it") from error

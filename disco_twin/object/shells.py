@@ -20,6 +20,10 @@ def check_shells(mesh: trimesh.Trimesh, path: Path, key: str, flip: str) -> None
 
     A shell inside another one is a cavity and has to be oriented inwards; one inside a cavity is solid again.
     """
+    place = crossing(mesh)
+    if place is not None:
+        problem = f"the mesh intersects itself near {np.round(place, 2).tolist()} mm"
+        raise InputError(problem, file=path, key=key, remedy="unite its parts (a boolean union, or a voxel remesh)")
     parts = mesh.split(only_watertight=False)
     for part in parts:
         around = [o for o in parts if o is not part and o.contains(part.vertices[:1])[0]]
@@ -33,10 +37,6 @@ def check_shells(mesh: trimesh.Trimesh, path: Path, key: str, flip: str) -> None
             problem, remedy = f"{where} lies inside another one and is not oriented inwards", "orient it as a cavity"
             raise InputError(problem, file=path, key=key, remedy=f"{remedy}, or take it out")
         raise InputError(f"{where} is inside out", file=path, key=key, remedy=flip)
-    place = crossing(mesh)
-    if place is not None:
-        problem = f"the mesh intersects itself near {np.round(place, 2).tolist()} mm"
-        raise InputError(problem, file=path, key=key, remedy="unite its parts (a boolean union, or a voxel remesh)")
 
 
 def crossing(mesh: trimesh.Trimesh) -> F64 | None:

@@ -77,7 +77,10 @@ CAMERA = {"name": "a", "width": 32, "height": 32}
             {"cameras": [CAMERA | {"position_mm": (450, 0, 50), "focal_length_mm": 0.2}]},
             ["rig.cameras[0].focal_length_mm = 0.2", "pixels"],
         ),
-        ({"projector": {"position_mm": (3, 1, 2)}}, ["rig.projector.position_mm = [3, 1, 2]", "inside the object"]),
+        (
+            {"projector": {"position_mm": (3, 1, 2)}},
+            ["rig.projector.position_mm = [3.0, 1.0", "inside the object"],
+        ),
     ],
 )
 def test_devices_that_cannot_see_the_object(changes: dict[str, object], parts: list[str]) -> None:
