@@ -88,12 +88,12 @@ def naming(file: str | Path) -> Iterator[None]:
 
 
 def refused_by_the_disk(error: OSError, folder: Path) -> DiscoError | None:
-    """A full or write-protected disk as an error for the user; None for any other reason.
+    """A full or write-protected disk, or a path that cannot be, as an error for the user; None for any other reason.
 
     NumPy reports a full disk without an error number ("16 requested and 0 written").
     """
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or "requested and" in str(error)
-    if not full and error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
+    if not full and error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.ENAMETOOLONG):
         return None
     why = "the disk is full" if full else (error.strerror or str(error)).lower()
     remedy = "make room" if full else "choose another --out"
