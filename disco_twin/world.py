@@ -88,10 +88,10 @@ class World:
 
     def object_mask(self, view: CameraConfig) -> NDArray[np.bool_]:
         """(H, W) pixels of a held-out view that the object fills by at least a half."""
-        from pipeline.relight.surface import Surface
+        from pipeline.reconstruct.mesh import first_hit
 
         camera = PinholeCamera.from_config(view)
-        face, _ = Surface.of(self.object.mesh).first_hit(*camera.rays(camera.pixel_centres(SUPERSAMPLE)))
+        face = first_hit(self.object.mesh, *camera.rays(camera.pixel_centres(SUPERSAMPLE))).triangle
         fine = (face >= 0).reshape(camera.height, SUPERSAMPLE, camera.width, SUPERSAMPLE)
         return np.asarray(fine.mean(axis=(1, 3)) >= 0.5)
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse import linalg as sparse_linalg
 
 from pipeline.calibrate.fresnel import Boundary, transmittance
+from pipeline.reconstruct.mesh import vertex_areas
 from pipeline.relight.arrival import colour, finest_mm, from_many_directions, from_one_direction
 from pipeline.relight.lights import Environment, Light, Uniform
 from pipeline.relight.surface import F64, Int, Surface
@@ -170,4 +171,4 @@ def transmitted_flux(
     moments = hat_moments(light, mesh, eta, lasers, accuracy)
     surface = Surface.of(mesh)
     density = sparse_linalg.spsolve(surface.mass_matrix(), moments.T).reshape(surface.vertices, lasers)
-    return np.asarray((density * surface.vertex_areas()[:, None]).T)
+    return np.asarray((density * vertex_areas(surface.mesh)[:, None]).T)

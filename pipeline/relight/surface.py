@@ -67,28 +67,6 @@ class Surface:
             hidden[ask] = self.mesh.ray.intersects_any(origins, towards[ask])
         return hidden
 
-    def first_hit(self, origins: F64, directions: F64) -> tuple[Int, F64]:
-        """Rays (N, 3) mm and unit -> (N,) face first hit or -1, (N, 3) barycentric coordinates there (0 if none)."""
-        face = np.asarray(self.mesh.ray.intersects_first(origins, directions), np.int64)
-        bary = np.zeros((len(face), 3))
-        hit = np.flatnonzero(face >= 0)
-        a, b, c = np.moveaxis(self.corners[face[hit]], 1, 0)
-        n, o, d = self.normals[face[hit]], origins[hit], directions[hit]
-        slope = (n * d).sum(axis=1)
-        slope = np.where(np.abs(slope) > 1e-12, slope, 1e-12)
-        p = o + d * ((n * (a - o)).sum(axis=1) / slope)[:, None]
-        area = 2 * self.areas[face[hit]]
-        bary[hit, 1] = (np.cross(a - c, p - c) * n).sum(axis=1) / area
-        bary[hit, 2] = (np.cross(b - a, p - a) * n).sum(axis=1) / area
-        bary[hit, 0] = 1 - bary[hit, 1] - bary[hit, 2]
-        bary[hit] = np.clip(bary[hit], 0.0, 1.0)  # embree's edges are float32 wide
-        bary[hit] /= bary[hit].sum(axis=1, keepdims=True)
-        return face, bary
-
-    def vertex_areas(self) -> F64:
-        """(V,) integrals of the hat functions in mm^2: a third of the faces around."""
-        return np.bincount(self.faces.ravel(), np.repeat(self.areas / 3, 3), self.vertices).astype(np.float64)
-
     def mass_matrix(self) -> sparse.csc_matrix:
         """(V, V) integrals of the products of two hat functions in mm^2; its row sums are the vertex areas."""
         local = self.areas[:, None, None] / 12 * (np.ones((3, 3)) + np.eye(3))

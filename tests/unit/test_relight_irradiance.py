@@ -11,6 +11,7 @@ from scipy.integrate import dblquad
 from hw.errors import InputError
 from pipeline.calibrate.camera import look_at
 from pipeline.calibrate.fresnel import mean_transmittance, transmittance
+from pipeline.reconstruct.mesh import first_hit, vertex_areas
 from pipeline.relight.arrival import from_many_directions
 from pipeline.relight.irradiance import Accuracy, hat_moments, irradiance, transmitted_flux
 from pipeline.relight.lights import (
@@ -56,7 +57,7 @@ def shelf(lower: float, upper: float, gap: float) -> trimesh.Trimesh:
 def test_uniform_light_on_a_convex_body_is_pi_l_tbar() -> None:
     mesh = ball()
     q = transmitted_flux(Uniform(radiance=2.0, colour=(1, 0.5, 0.25)), mesh, 1.3, 3)
-    area = Surface.of(mesh).vertex_areas()
+    area = vertex_areas(mesh)
     expected = 2 * np.pi * mean_transmittance(1.3) * np.outer([1, 0.5, 0.25], area)
     np.testing.assert_allclose(q, expected, rtol=1.5e-4)  # 256 directions; F_t is steep at grazing angles
 
@@ -301,13 +302,13 @@ def test_projection_keeps_the_total_and_a_constant_density() -> None:
     moments, q = hat_moments(light, mesh, 1.3, 1), transmitted_flux(light, mesh, 1.3, 1)
     assert q.sum() == pytest.approx(moments.sum(), rel=1e-12)
     surface = Surface.of(mesh)
-    np.testing.assert_allclose(np.asarray(surface.mass_matrix().sum(axis=1)).ravel(), surface.vertex_areas())
+    np.testing.assert_allclose(np.asarray(surface.mass_matrix().sum(axis=1)).ravel(), vertex_areas(surface.mesh))
     dense = np.zeros((len(mesh.vertices),) * 2)
     for face, area in zip(mesh.faces, mesh.area_faces, strict=True):
         dense[np.ix_(face, face)] += area / 12 * (1 + np.eye(3))  # integrals of products of barycentric coordinates
     np.testing.assert_allclose(q[0], dense.sum(axis=1) * np.linalg.solve(dense, moments[0]), rtol=1e-9, atol=1e-9)
     flat = transmitted_flux(Uniform(), ball(), 1.0, 1)[0]  # density pi everywhere
-    np.testing.assert_allclose(flat, np.pi * Surface.of(ball()).vertex_areas(), rtol=1e-10)
+    np.testing.assert_allclose(flat, np.pi * vertex_areas(ball()), rtol=1e-10)
 
 
 def test_mass_projection_relights_better_than_hat_weights() -> None:
@@ -318,7 +319,8 @@ def test_mass_projection_relights_better_than_hat_weights() -> None:
     mesh = ball(2)
     surface = Surface.of(mesh)
     fine = trimesh.creation.icosphere(subdivisions=4, radius=20).vertices
-    face, bary = surface.first_hit(3 * fine, -fine / 20)
+    hit = first_hit(surface.mesh, 3 * fine, -fine / 20)
+    face, bary = hit.triangle, hit.barycentric
     hats = np.zeros((len(fine), surface.vertices))
     np.put_along_axis(hats, surface.faces[face], bary, axis=1)
     area = hats.sum(axis=0)
