@@ -27,6 +27,7 @@ FOCAL_SHARE, CENTRE_SHARE, RADIAL_K1 = 0.003, 0.005, 0.05  # of the focal length
 PROJECTOR_MM, PROJECTOR_DEG, MIRROR_ANGLE_SHARE = 1.0, 0.1, 0.003
 TURNTABLE_MM, TURNTABLE_TILT_DEG, TURNTABLE_DEG = 0.1, 0.05, 0.05
 MIRROR_STEPS = 0.5  # error of each move, per mirror
+RESPONSE_SHARE, PHOTODIODE_SHARE = 0.03, 0.03  # of the responsivities that the data sheets state
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,8 @@ class ActualRig:
     """cameras, projector: in the world frame; turns: per turntable angle, (4, 4) object -> world.
 
     mirror_steps: standard deviation of the mirrors' error; the error of an aim depends on `seed` and the aim alone.
+    response: (C, L) what a camera shows of a laser's light, and photodiode: (L,) what the photodiode reads of its
+    power, both relative to the data sheets.
     """
 
     cameras: tuple[PinholeCamera, ...]
@@ -41,6 +44,8 @@ class ActualRig:
     turns: tuple[F64, ...]
     mirror_steps: float
     seed: int
+    response: F64
+    photodiode: F64
 
     def camera(self, camera: int, angle: int) -> PinholeCamera:
         """A camera in the object frame, at a turntable angle (index)."""
@@ -68,23 +73,27 @@ def actual_rig(config: RigConfig, seed: int) -> ActualRig:
     cameras = tuple(PinholeCamera.from_config(c) for c in config.cameras)
     projector = TwoMirrorProjector.from_config(config.projector)
     turns = [turn(np.deg2rad(a)) for a in config.turntable_angles_deg]
+    response, photodiode = np.ones((len(cameras), len(config.lasers))), np.ones(len(config.lasers))
     if not config.faults.deviation:
-        return ActualRig(cameras, projector, tuple(turns), 0.0, seed)
+        return ActualRig(cameras, projector, tuple(turns), 0.0, seed, response, photodiode)
     cameras = tuple(_off(c, generator(seed, Stream.DEVIATION, 1, i)) for i, c in enumerate(cameras))
     rng = generator(seed, Stream.DEVIATION, 2)
     projector = replace(
         projector,
-        pose=_nudge(rng, PROJECTOR_MM, PROJECTOR_DEG) @ projector.pose,
+        pose=nudge(rng, PROJECTOR_MM, PROJECTOR_DEG) @ projector.pose,
         full_angle_rad=projector.full_angle_rad * (1 + MIRROR_ANGLE_SHARE * rng.standard_normal(2)),
     )
     rng = generator(seed, Stream.DEVIATION, 3)
-    axis = _nudge(rng, TURNTABLE_MM, TURNTABLE_TILT_DEG)
+    axis = nudge(rng, TURNTABLE_MM, TURNTABLE_TILT_DEG)
     errors = np.deg2rad(TURNTABLE_DEG) * rng.standard_normal(len(turns))
     turns = [axis @ at @ turn(error) @ np.linalg.inv(axis) for at, error in zip(turns, errors, strict=True)]
-    return ActualRig(cameras, projector, tuple(turns), MIRROR_STEPS, seed)
+    rng = generator(seed, Stream.DEVIATION, 4)
+    response = response * (1 + RESPONSE_SHARE * rng.standard_normal(response.shape))
+    photodiode = photodiode * (1 + PHOTODIODE_SHARE * rng.standard_normal(photodiode.shape))
+    return ActualRig(cameras, projector, tuple(turns), MIRROR_STEPS, seed, response, photodiode)
 
 
-def _nudge(rng: Generator, length_mm: float, angle_deg: float) -> F64:
+def nudge(rng: Generator, length_mm: float, angle_deg: float) -> F64:
     """(4, 4) small rigid motion: normal shift per axis, normal rotation vector."""
     motion = np.eye(4)
     motion[:3, :3] = Rotation.from_rotvec(np.deg2rad(angle_deg) * rng.standard_normal(3)).as_matrix()
@@ -96,7 +105,7 @@ def _off(camera: PinholeCamera, rng: Generator) -> PinholeCamera:
     """The camera as it stands on its tripod, with the lens that it has."""
     return replace(
         camera,
-        pose=_nudge(rng, CAMERA_MM, CAMERA_DEG) @ camera.pose,
+        pose=nudge(rng, CAMERA_MM, CAMERA_DEG) @ camera.pose,
         focal=camera.focal * (1 + FOCAL_SHARE * rng.standard_normal()),
         centre=camera.centre + CENTRE_SHARE * camera.width * rng.standard_normal(2),
         distortion=camera.distortion + RADIAL_K1 * np.array([rng.standard_normal(), 0, 0, 0, 0]),

@@ -35,6 +35,7 @@ class Stream(IntEnum):
     LASER = 4
     DEVIATION = 5
     MIRRORS = 6
+    TARGETS = 7
 
 
 def generator(seed: int, stream: Stream, *address: int) -> Generator:

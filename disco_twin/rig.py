@@ -7,7 +7,7 @@ back to where it was and resumed meets the same times (and noise) as one that wa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -27,6 +27,7 @@ F32 = NDArray[np.float32]
 
 FRAMES_PER_IMAGE = 2  # every other frame is discarded while the mirrors move (thesis 4.1)
 TURN_S = 8.0  # turning to another angle and coming to rest
+EXCHANGE_S = 20.0  # taking a calibration target away and putting the next one up
 PHOTODIODE_NOISE = 1e-3  # of the reading, standard deviation
 PHOTODIODE_RANGE = 2.0  # top of its converter, in the laser's nominal power
 
@@ -71,7 +72,7 @@ class TwinRig:
 
     def __init__(self, config: RigConfig, source: ResponseSource, seed: int, actual: ActualRig | None = None) -> None:
         actual = actual_rig(config, seed) if actual is None else actual
-        self.config, self.source, self.seed = config, source, seed
+        self.config, self.source, self.seed, self.actual = config, source, seed, actual
         self.power: Power = LaserPower(config.lasers, config.faults, seed)
         self.lasers: Sequence[Laser] = [TwinLaser(self, i) for i in range(len(config.lasers))]
         self.projector: Projector = TwinProjector(self)
@@ -216,6 +217,36 @@ class TwinTurntable:
         self.rig.alter(angle=nearest)
 
 
+class TargetRig(TwinRig):
+    """One camera of the twin, with targets in the object's place: the "turntable" is a person who exchanges them."""
+
+    def __init__(
+        self, config: RigConfig, source: ResponseSource, seed: int, actual: ActualRig, camera: int, placements: int
+    ) -> None:
+        only = slice(camera, camera + 1)
+        config = config.model_copy(update={"cameras": config.cameras[only]})
+        one = replace(actual, cameras=actual.cameras[only], response=actual.response[only])
+        super().__init__(config, source, seed, one)
+        self.turntable = TwinTargetHolder(self, placements)
+
+
+@dataclass
+class TwinTargetHolder:
+    """Puts target number `angle_rad` in place."""
+
+    rig: TwinRig
+    placements: int
+
+    def move(self, angle_rad: float) -> None:
+        """Exchange the target, if it is not there yet."""
+        self.rig.require_dark("target")
+        if not 0 <= angle_rad < self.placements or angle_rad != int(angle_rad):
+            raise InputError("no such target", key="placement", value=angle_rad, allowed=f"0 to {self.placements - 1}")
+        if int(angle_rad) != self.rig.scene.angle:
+            self.rig.clock += EXCHANGE_S
+        self.rig.alter(angle=int(angle_rad))
+
+
 @dataclass
 class TwinCamera:
     """One camera. Its noise depends on what it sees, and differs between exposures in a row of an unchanged scene."""
@@ -244,8 +275,9 @@ class TwinCamera:
             max(scene.gate, 0),
             generator(rig.seed, Stream.SENSOR, *address, repeats),
         )
+        gain = 1.0 if scene.gate < 0 else rig.actual.photodiode[scene.gate]
         scale = watts_per_count(rig.config.lasers[max(scene.gate, 0)])
-        rig.counts = min(max(round(watts * (1.0 + PHOTODIODE_NOISE * float(noise)) / scale), 0), ADC_TOP)
+        rig.counts = min(max(round(watts * gain * (1.0 + PHOTODIODE_NOISE * float(noise)) / scale), 0), ADC_TOP)
         rig.reading = rig.counts * scale
         rig.clock += FRAMES_PER_IMAGE * frame
         return raw
@@ -262,6 +294,7 @@ class TwinCamera:
             radiance = radiance + light
         if scene.flood:
             radiance = radiance + rig.source.silhouette(self.index, scene.angle)
+        radiance = radiance * np.float32(rig.actual.response[self.index, max(scene.gate, 0)])
         if not (radiance.min() >= 0.0 and np.isfinite(radiance.max())):
             raise DiscoError(f"the simulated light of camera {self.name} at {scene} is negative or not finite")
         return radiance

@@ -1,0 +1,161 @@
+"""The outline of the scan in an image, and where the image itself shows the edge, to a few hundredths of a pixel.
+
+An edge is fitted along the outline's normal: background, then a step, then a shading that rises with the square root
+of the depth, as it does at every smooth rim; all blurred by the pixel. A threshold would be off by a tenth of a pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy import ndimage, special
+from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+from pipeline.calibrate.camera import PinholeCamera
+
+F64 = NDArray[np.float64]
+
+PIXEL_BLUR = 12**-0.5  # standard deviation of a pixel's own box, in pixels
+INSIDE, OUTSIDE, SPACING = 4.0, 3.0, 0.5  # pixels along the normal that an edge is fitted to
+REACH, GRID = 2.0, 0.05  # an edge is looked for within this distance of the outline, in these steps
+CLEAR = 0.7  # pixels outside the outline where nothing of the object may be
+SHARP_RAD = 0.5  # between the triangles at an edge of the object's own; below, they stand for a smooth surface
+SUPERSAMPLE = 4  # rays per pixel and axis of a synthetic image
+NOISY = 0.25  # an edge whose model leaves more than this share of its height is not used
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Points of the mesh that lie on its outline. points: (K, 3) object frame; pixel, normal: (K, 2), normal outward.
+
+    across: (K, 3) the surface's unit normal in the camera's frame; only motion along it moves the outline
+    length: (K,) pixels of the outline that each stands for
+    """
+
+    points: F64
+    pixel: F64
+    normal: F64
+    across: F64
+    length: F64
+
+
+def outline(mesh: trimesh.Trimesh, camera: PinholeCamera) -> Outline:
+    """Outer contour of the mesh's projection; camera in the object frame. Edges inside the silhouette are left out."""
+    towards = mesh.triangles_center - camera.position
+    front = (mesh.face_normals * towards).sum(axis=1) < 0
+    pairs, edges = mesh.face_adjacency, mesh.face_adjacency_edges
+    rim = front[pairs[:, 0]] != front[pairs[:, 1]]
+    ends = np.asarray(mesh.vertices)[edges[rim]]  # (E, 2, 3)
+    facing = np.where(front[pairs[rim, 0]], pairs[rim, 0], pairs[rim, 1])
+    smooth = np.asarray(mesh.vertex_normals)[edges[rim]] @ camera.pose[:3, :3].T  # (E, 2, 3), camera's frame
+    sharp = mesh.face_adjacency_angles[rim] > SHARP_RAD
+    pixel = np.stack([camera.project(ends[:, k])[0] for k in (0, 1)], axis=1)
+    size = np.linalg.norm(pixel[:, 1] - pixel[:, 0], axis=1)
+    keep = size > 1e-6
+    ends, facing, pixel, size, smooth, sharp = (x[keep] for x in (ends, facing, pixel, size, smooth, sharp))
+    parts = np.maximum(np.ceil(size), 1).astype(int)
+    index = np.repeat(np.arange(len(parts)), parts)
+    share = (np.arange(len(index)) - np.repeat(np.cumsum(parts) - parts, parts) + 0.5) / parts[index]
+    points = ends[index, 0] * (1 - share)[:, None] + ends[index, 1] * share[:, None]
+    along = (pixel[:, 1] - pixel[:, 0]) / size[:, None]
+    normal = np.column_stack([along[:, 1], -along[:, 0]])
+    inward = camera.project(np.asarray(mesh.triangles_center)[facing])[0] - pixel.mean(axis=1)
+    normal *= -np.sign((normal * inward).sum(axis=1))[:, None]
+    # A rim of a finely faceted surface zigzags, the surface's own normal does not.
+    across = _unit(smooth[index, 0] * (1 - share)[:, None] + smooth[index, 1] * share[:, None])
+    at, length = camera.project(points)[0], (size / parts)[index]
+    rays = camera.undistort((at - camera.centre) / camera.focal)
+    flat = normal[index]  # of the plane through the eye and a sharp edge
+    flat = _unit(np.column_stack([flat, -(flat * rays).sum(axis=1)]))
+    across = np.where(sharp[index, None], flat, across)
+    normal = _unit(across[:, :2])
+    outer = ~mesh.ray.intersects_any(*camera.rays(at + CLEAR * normal))
+    return Outline(points[outer], at[outer], normal[outer], across[outer], length[outer])
+
+
+def _unit(vectors: F64) -> F64:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12))
+
+
+@lru_cache(maxsize=1)
+def _edge_models() -> tuple[F64, F64, F64]:
+    """(M,) offsets along the normal, (E,) edge positions, (E, M, 3) orthonormal bases of step, shading, background."""
+    offset, edge = np.arange(-INSIDE, OUTSIDE + 1e-9, SPACING), np.arange(-REACH, REACH + 1e-9, GRID)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(41)
+    depth = edge[:, None] - offset
+    step = special.ndtr(depth / PIXEL_BLUR)
+    shading = (np.sqrt(np.maximum(depth[..., None] + PIXEL_BLUR * nodes, 0)) * weights).sum(axis=2) / weights.sum()
+    bases = np.stack([step, shading, np.ones_like(step)], axis=2)
+    return offset, edge, np.linalg.qr(bases)[0]
+
+
+def edges_along(image: NDArray[np.floating], pixel: F64, normal: F64) -> tuple[F64, NDArray[np.bool_]]:
+    """(K,) pixels outward of (K, 2) `pixel` at which the image's edge crosses each of (K, 2) normals, (K,) if found."""
+    offset, edge, bases = _edge_models()
+    at = pixel[:, None] + offset[:, None] * normal[:, None]
+    spline = ndimage.spline_filter(np.asarray(image, np.float64), mode="nearest")
+    value = ndimage.map_coordinates(spline, [at[..., 1] - 0.5, at[..., 0] - 0.5], mode="nearest", prefilter=False)
+    total = (value**2).sum(axis=1)
+    explained = (np.einsum("emb,km->ekb", bases, value) ** 2).sum(axis=2)  # (E, K)
+    best = np.clip(explained.argmax(axis=0), 1, len(edge) - 2)
+    k = np.arange(len(pixel))
+    before, here, after = explained[best - 1, k], explained[best, k], explained[best + 1, k]
+    bend = before - 2 * here + after
+    found = edge[best] + GRID * np.where(bend < 0, 0.5 * (before - after) / np.minimum(bend, -1e-300), 0.0)
+    height = value[:, offset <= -1].mean(axis=1) - value[:, offset >= 2].mean(axis=1)
+    rest = np.sqrt(np.maximum(total - here, 0) / len(offset))
+    edge_in_view = ((at > 0) & (at < [image.shape[1], image.shape[0]])).all(axis=(1, 2))
+    good = (bend < 0) & (np.abs(found) < REACH - GRID) & (height > 0) & (rest < NOISY * height) & edge_in_view
+    return np.clip(found, -REACH, REACH), good
+
+
+def object_mask(image: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """(H, W) the thesis's silhouette: a threshold, between the background and the darkest parts of the object."""
+    image = np.asarray(image, np.float64)
+    dark, light = np.percentile(image, 5), np.percentile(image, 99)
+    return np.asarray(ndimage.binary_opening(image > dark + 0.15 * (light - dark)))
+
+
+def signed_distance(mask: NDArray[np.bool_]) -> F64:
+    """(H, W) pixels from the mask's border, positive outside."""
+    outside, inside = ndimage.distance_transform_edt(~mask), ndimage.distance_transform_edt(mask)
+    return np.asarray(np.where(mask, 0.5 - inside, outside - 0.5))
+
+
+def mesh_mask(mesh: trimesh.Trimesh, camera: PinholeCamera) -> NDArray[np.bool_]:
+    """(H, W) pixels whose centre shows the mesh."""
+    hit = mesh.ray.intersects_any(*camera.rays(camera.pixel_centres()))
+    return np.asarray(hit.reshape(camera.height, camera.width))
+
+
+def synthetic(mesh: trimesh.Trimesh, camera: PinholeCamera, image: NDArray[np.floating]) -> F64:
+    """(H, W) the mesh as the camera would see it in the light of `image`.
+
+    The light is taken from the image's own inside: a matt surface shows second-order spherical harmonics of its normal
+    under any distant light (Ramamoorthi and Hanrahan 2001, eq. 12), nine coefficients by least squares.
+    """
+    s = SUPERSAMPLE
+    origins, directions = camera.rays(camera.pixel_centres(s))
+    triangle = RayMeshIntersector(mesh).intersects_first(origins, directions)
+    hit = np.flatnonzero(triangle >= 0)
+    face = triangle[hit]
+    corners, flat = mesh.triangles[face], mesh.face_normals[face]
+    along = ((corners[:, 0] - origins[hit]) * flat).sum(axis=1) / (directions[hit] * flat).sum(axis=1)
+    place = origins[hit] + along[:, None] * directions[hit]
+    weights = np.clip(trimesh.triangles.points_to_barycentric(corners, place), 0, 1)
+    normal = (mesh.vertex_normals[mesh.faces[face]] * weights[:, :, None]).sum(axis=1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    x, y, z = normal.T
+    basis = np.column_stack([np.ones_like(x), x, y, z, x * y, x * z, y * z, x * x - y * y, 3 * z * z - 1])
+    rows, columns = np.divmod(hit, camera.width * s)
+    pixel = rows // s * camera.width + columns // s
+    shape = (camera.height, camera.width)
+    count = np.bincount(pixel, minlength=shape[0] * shape[1])
+    mean = np.stack([np.bincount(pixel, b, minlength=len(count)) for b in basis.T], axis=1) / s**2
+    inside = ndimage.binary_erosion((count == s * s).reshape(shape)).ravel()
+    light = np.linalg.lstsq(mean[inside], np.asarray(image, np.float64).ravel()[inside], rcond=None)[0]
+    return np.asarray(np.maximum(mean @ light, 0.0).reshape(shape))

@@ -1,0 +1,312 @@
+"""Where the object stands before each camera, from silhouettes (thesis 5.2.2), all views of a sweep together.
+
+Unknown are each camera's pose at the first turntable angle, the turntable's axis, the angles' small errors and, within
+what the boards left open, each camera's lens. A coarse stage walks down the distance to the photographed silhouette
+from centimetres and ten degrees away, a fine one fits edges to a few hundredths of a pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from pipeline.calibrate.camera import PinholeCamera, turn
+from pipeline.calibrate.outline import Outline, edges_along, mesh_mask, object_mask, outline, signed_distance, synthetic
+
+F64 = NDArray[np.float64]
+
+# What the set-up keeps to, standard deviations. Silhouettes overrule all of it where they can tell.
+PLACE_MM, PLACE_RAD = 20.0, np.deg2rad(10.0)  # of a camera against the object
+AXIS_MM, AXIS_RAD = 1.0, np.deg2rad(0.5)  # of the turntable's axis against the object frame's z axis
+ANGLE_RAD = np.deg2rad(0.1)  # of a turntable angle
+UNDETERMINED_RAD, UNDETERMINED_MM = np.deg2rad(1.0), 5.0  # a direction that is known no better is stated as open
+COARSE_STEPS, FINE_STEPS, EXACT_STEPS = 25, 5, 2
+HUBER_COARSE_PX, HUBER_FINE_PX = 3.0, 0.15
+SECTORS = 24  # per view: errors of the edges within one are taken as dependent
+COMMON_EDGE_PX = 0.003  # by which all edges of a camera may be off together
+LENS = 4  # focal, centre x, y, k1
+
+
+@dataclass(frozen=True)
+class PoseFit:
+    """views: per view, camera in the object frame; turns: per angle, (4, 4) object -> object at the first angle.
+
+    rotation, translation: (V, 3) standard deviations of each view's pose: of the object about its own origin, in rad
+    along the camera's axes, and of the origin, mm; residual_px: root mean square of the edges; edges: their number
+    ambiguity: directions that the silhouettes leave open, in words; empty if there is none
+    xor_pixels: per view, the thesis's measure of mismatch (figure 5.1)
+    """
+
+    views: tuple[PinholeCamera, ...]
+    turns: tuple[F64, ...]
+    rotation: F64
+    translation: F64
+    residual_px: float
+    edges: int
+    ambiguity: tuple[str, ...] = ()
+    xor_pixels: tuple[int, ...] = ()
+
+
+@dataclass
+class _Sweep:
+    """The unknowns and how the views follow from them. Increments are taken about the current values."""
+
+    lenses: list[PinholeCamera]  # per camera, object frame at the first angle
+    angles: F64  # (J,) nominal, relative to the first
+    axis: F64 = field(default_factory=lambda: np.zeros(4))  # tilt about x, y; shift along x, y
+    errors: F64 = field(default_factory=lambda: np.zeros(0))  # (J - 1,)
+
+    @property
+    def size(self) -> int:
+        return (6 + LENS) * len(self.lenses) + (4 + len(self.angles) - 1 if len(self.angles) > 1 else 0)
+
+    def turns(self) -> list[F64]:
+        """Per angle, (4, 4) object -> object at the first angle."""
+        place = np.eye(4)
+        place[:3, :3] = Rotation.from_rotvec([*self.axis[:2], 0]).as_matrix()
+        place[:2, 3] = self.axis[2:]
+        back = np.linalg.inv(place)
+        return [place @ turn(a) @ back for a in self.angles + np.concatenate([[0.0], self.errors])]
+
+    def view(self, view: int) -> PinholeCamera:
+        camera, angle = divmod(view, len(self.angles))
+        return self.lenses[camera].seen_from(self.turns()[angle])
+
+    def moved(self, step: F64) -> _Sweep:
+        lenses = []
+        for c, lens in enumerate(self.lenses):
+            own = step[(6 + LENS) * c : (6 + LENS) * (c + 1)]
+            pose = lens.pose.copy()
+            pose[:3, :3] = Rotation.from_rotvec(own[:3]).as_matrix() @ pose[:3, :3]
+            pose[:3, 3] += own[3:6]
+            bent = lens.distortion + np.array([own[9], 0, 0, 0, 0])
+            focal = lens.focal + own[6]
+            lenses.append(replace(lens, pose=pose, focal=focal, centre=lens.centre + own[7:9], distortion=bent))
+        rest = step[(6 + LENS) * len(self.lenses) :]
+        if not len(rest):
+            return _Sweep(lenses, self.angles, self.axis, self.errors)
+        return _Sweep(lenses, self.angles, self.axis + rest[:4], self.errors + rest[4:])
+
+    def jacobian(self, view: int, rim: Outline) -> F64:
+        """(K, P) pixels by which the outline moves along its normals, by the increments; central differences.
+
+        A pose moves a smooth outline only as far as it moves the surface along its own normal.
+        """
+        base, columns = np.zeros(self.size), []
+        camera, here = view // len(self.angles), self.view(view)
+        depth = rim.points @ here.pose[2, :3] + here.pose[2, 3]
+        scale = here.focal.mean() / (depth * np.linalg.norm(rim.across[:, :2], axis=1))
+        for k in range(self.size):
+            lens = k < (6 + LENS) * len(self.lenses)
+            if lens and k // (6 + LENS) != camera:
+                columns.append(np.zeros(len(depth)))
+                continue
+            h = 1e-3 if lens and k % (6 + LENS) == 9 else 1e-2 if lens and k % (6 + LENS) > 2 else 1e-4
+            base[k] = h
+            ahead, behind = (self.moved(sign * base).view(view) for sign in (1, -1))
+            base[k] = 0
+            if lens and k % (6 + LENS) >= 6:
+                moved = (ahead.project(rim.points)[0] - behind.project(rim.points)[0]) * rim.normal
+                columns.append(moved.sum(axis=1) / (2 * h))
+            else:
+                change = (ahead.pose - behind.pose) / (2 * h)
+                columns.append(scale * ((rim.points @ change[:3, :3].T + change[:3, 3]) * rim.across).sum(axis=1))
+        return np.stack(columns, axis=1)
+
+
+def _priors(sweep: _Sweep, lens_covariance: Sequence[F64]) -> F64:
+    """(P, P) precision of the increments about the starting values."""
+    precision = np.zeros((sweep.size, sweep.size))
+    for c, covariance in enumerate(lens_covariance):
+        at = (6 + LENS) * c
+        precision[at : at + 6, at : at + 6] = np.diag([PLACE_RAD**-2] * 3 + [PLACE_MM**-2] * 3)
+        precision[at + 6 : at + 10, at + 6 : at + 10] = np.linalg.inv(covariance + np.diag([1e-6, 1e-8, 1e-8, 1e-12]))
+    rest = sweep.size - (6 + LENS) * len(sweep.lenses)
+    if rest:
+        sigma = np.array([AXIS_RAD] * 2 + [AXIS_MM] * 2 + [ANGLE_RAD] * (rest - 4))
+        at = sweep.size - rest
+        precision[at:, at:] = np.diag(sigma**-2)
+    return precision
+
+
+def fit_poses(
+    images: Sequence[NDArray[np.floating]],
+    mesh: trimesh.Trimesh,
+    cameras: Sequence[PinholeCamera],
+    angles: Sequence[float],
+    lens_covariance: Sequence[F64] | None = None,
+) -> PoseFit:
+    """images: per view (cameras outermost), (H, W) radiance under the floodlight; cameras: object frame, first angle.
+
+    lens_covariance: per camera, (4, 4) of focal, centre, k1; None: the lenses are exact
+    """
+    exact = [np.zeros((LENS, LENS))] * len(cameras)
+    covariance = exact if lens_covariance is None else lens_covariance
+    relative = np.asarray(angles, float) - angles[0]
+    start = _Sweep(list(cameras), relative, errors=np.zeros(len(relative) - 1))
+    masks = [object_mask(image) for image in images]
+    sweep = _coarse(start, masks, mesh, covariance)
+    return _fine(sweep, start, images, masks, mesh, covariance)
+
+
+def _coarse(start: _Sweep, masks: Sequence[NDArray[np.bool_]], mesh: trimesh.Trimesh, lens: Sequence[F64]) -> _Sweep:
+    """Down the distance to the silhouettes, from several starts that differ by a few degrees; the best by XOR."""
+    distances = [signed_distance(m) for m in masks]
+    precision = _priors(start, lens)
+    best, fewest = start, np.inf
+    for tilt in _STARTS:
+        sweep = start
+        for c, camera in enumerate(start.lenses):
+            step = np.zeros(start.size)
+            step[(6 + LENS) * c : (6 + LENS) * c + 3] = tilt
+            sweep = _centred(sweep.moved(step), c, masks[c * len(start.angles)], mesh, camera)
+        total: F64 = np.zeros(start.size)
+        for _ in range(COARSE_STEPS):
+            hessian, gradient = precision * 1e-2, -1e-2 * precision @ total
+            for v, distance in enumerate(distances):
+                rim = outline(mesh, sweep.view(v))
+                if not len(rim.pixel):
+                    continue
+                away = ndimage.map_coordinates(distance, rim.pixel.T[::-1] - 0.5, order=1, mode="nearest")
+                weight = rim.length / np.maximum(np.abs(away) / HUBER_COARSE_PX, 1.0)
+                j = sweep.jacobian(v, rim)
+                hessian = hessian + j.T @ (j * weight[:, None])
+                gradient = gradient - j.T @ (weight * away)
+            step = np.linalg.solve(hessian + 1e-9 * np.diag(np.diag(hessian)), gradient)
+            sweep, total = sweep.moved(step), total + step
+            if np.abs(step[: 6 + LENS][:3]).max() < 2e-4:
+                break
+        wrong = sum(int((mesh_mask(mesh, sweep.view(v)) ^ m).sum()) for v, m in enumerate(masks))
+        if wrong < fewest:
+            best, fewest = sweep, wrong
+        if fewest < GOOD_ENOUGH * sum(int(m.sum()) for m in masks):
+            break
+    return best
+
+
+_TEN = np.deg2rad(8.0)
+_STARTS = np.array([(0, 0, 0), (_TEN, 0, 0), (-_TEN, 0, 0), (0, _TEN, 0), (0, -_TEN, 0), (0, 0, _TEN), (0, 0, -_TEN)])
+GOOD_ENOUGH = 0.012  # XOR as a share of the silhouettes: no other start is tried
+
+
+def _centred(
+    sweep: _Sweep, camera: int, mask: NDArray[np.bool_], mesh: trimesh.Trimesh, nominal: PinholeCamera
+) -> _Sweep:
+    """Shift the object before a camera until centroid and area of its silhouette are the photograph's."""
+    for _ in range(3):
+        seen = sweep.lenses[camera]
+        own = mesh_mask(mesh, seen)
+        if not own.any() or not mask.any():
+            return sweep
+        ratio = float(np.sqrt(own.sum() / mask.sum()))
+        centre = np.array([ndimage.center_of_mass(m)[::-1] for m in (own, mask)])
+        depth = seen.pose[2, 3]
+        step = np.zeros(sweep.size)
+        at = (6 + LENS) * camera + 3
+        step[at : at + 2] = (centre[1] - centre[0]) * depth / seen.focal
+        step[at + 2] = depth * (ratio - 1.0)
+        sweep = sweep.moved(step)
+    return sweep
+
+
+def _fine(
+    sweep: _Sweep,
+    start: _Sweep,
+    images: Sequence[NDArray[np.floating]],
+    masks: Sequence[NDArray[np.bool_]],
+    mesh: trimesh.Trimesh,
+    lens: Sequence[F64],
+) -> PoseFit:
+    """Gauss-Newton on the edges, then the covariance from what the edges leave unexplained, sector by sector."""
+    precision = _priors(sweep, lens)
+    total: F64 = np.zeros(sweep.size)
+    rows: list[tuple[F64, F64, F64, NDArray[np.int64]]] = []
+    variance = 0.05**2
+    for last in range(FINE_STEPS):
+        rows = [_edges_of(sweep, v, image, mesh, last >= FINE_STEPS - EXACT_STEPS) for v, image in enumerate(images)]
+        j, rest, length, sector = (np.concatenate([r[k] for r in rows]) for k in range(4))
+        weight = length / np.maximum(np.abs(rest) / HUBER_FINE_PX, 1.0)
+        variance = float((weight * rest**2).sum() / weight.sum())
+        hessian = j.T @ (j * weight[:, None]) / variance
+        step = np.linalg.solve(hessian + precision, j.T @ (weight * rest) / variance - precision @ total)
+        sweep, total = sweep.moved(step), total + step
+    scores = np.zeros((sector.max(initial=0) + 1, sweep.size))
+    np.add.at(scores, sector, j * (weight * (rest - j @ step) / variance)[:, None])
+    scores = scores[np.abs(scores).sum(axis=1) > 0]
+    count = len(scores)
+    inverse = np.linalg.inv(hessian + precision)
+    meat = scores.T @ scores * count / max(count - sweep.size, count / 4)
+    for c in range(len(sweep.lenses)):
+        common = sector // (SECTORS * len(sweep.angles)) == c
+        push = j[common].T @ weight[common] * (COMMON_EDGE_PX / variance)
+        meat += np.outer(push, push)
+    covariance = inverse @ (meat + precision) @ inverse
+    return _result(sweep, covariance, float(np.sqrt(variance)), len(rest), masks, mesh)
+
+
+def _edges_of(
+    sweep: _Sweep, view: int, image: NDArray[np.floating], mesh: trimesh.Trimesh, exact: bool
+) -> tuple[F64, F64, F64, NDArray[np.int64]]:
+    """One view's rows: (K, P) derivative of the edge's place, (K,) pixels it is off, (K,) weight, (K,) sector.
+
+    exact: where the edge is found in a synthetic image of the same pose is taken off, and with it the edge model's bias
+    """
+    camera = sweep.view(view)
+    rim = outline(mesh, camera)
+    away, good = edges_along(image, rim.pixel, rim.normal)
+    if exact:
+        bias, also = edges_along(synthetic(mesh, camera, image), rim.pixel, rim.normal)
+        away, good = away - bias, good & also
+    j = sweep.jacobian(view, rim)
+    around = np.arctan2(*(rim.pixel - rim.pixel.mean(axis=0)).T[::-1]) if len(rim.pixel) else np.zeros(0)
+    sector: NDArray[np.int64] = view * SECTORS + np.minimum((around / (2 * np.pi) + 0.5) * SECTORS, SECTORS - 1).astype(
+        np.int64
+    )
+    return j[good], away[good], rim.length[good], sector[good]
+
+
+def _result(
+    sweep: _Sweep,
+    covariance: F64,
+    residual: float,
+    edges: int,
+    masks: Sequence[NDArray[np.bool_]],
+    mesh: trimesh.Trimesh,
+) -> PoseFit:
+    views = [sweep.view(v) for v in range(len(masks))]
+    rotation, translation = np.zeros((len(views), 3)), np.zeros((len(views), 3))
+    ambiguity: list[str] = []
+    for v, view in enumerate(views):
+        j = _pose_jacobian(sweep, v)
+        own = j @ covariance @ j.T
+        rotation[v], translation[v] = np.sqrt(np.diag(own)[:3]), np.sqrt(np.diag(own)[3:])
+        for values, vectors, limit, what in (
+            (*np.linalg.eigh(own[:3, :3]), UNDETERMINED_RAD, "rotation about"),
+            (*np.linalg.eigh(own[3:, 3:]), UNDETERMINED_MM, "shift along"),
+        ):
+            for value, vector in zip(values, vectors.T, strict=True):
+                if value > limit**2:
+                    axis = view.pose[:3, :3].T @ vector
+                    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+                    ambiguity.append(f"view {v}: {what} ({axis[0]:.2f}, {axis[1]:.2f}, {axis[2]:.2f}) of the object")
+    xor = tuple(int((mesh_mask(mesh, view) ^ m).sum()) for view, m in zip(views, masks, strict=True))
+    return PoseFit(tuple(views), tuple(sweep.turns()), rotation, translation, residual, edges, tuple(ambiguity), xor)
+
+
+def _pose_jacobian(sweep: _Sweep, view: int) -> F64:
+    """(6, P) of a view's pose (rotation vector along the camera's axes, object's origin) by the increments."""
+    out, step = np.zeros((6, sweep.size)), np.zeros(sweep.size)
+    here = sweep.view(view).pose
+    for k in range(sweep.size):
+        step[k] = 1e-5
+        there = sweep.moved(step).view(view).pose
+        step[k] = 0
+        out[:3, k] = Rotation.from_matrix(there[:3, :3] @ here[:3, :3].T).as_rotvec() / 1e-5
+        out[3:, k] = (there[:3, 3] - here[:3, 3]) / 1e-5
+    return out

@@ -1,0 +1,241 @@
+"""Where the projector stands, from spots whose place on the surface is known (thesis 5.2.3), and its step size.
+
+First the projection matrix: homogeneous DLT by SVD with Hartley's normalisation, drawn many times from few spots so
+that false ones do not matter; the centre is the matrix's null vector. (The thesis prints 1, 2, 3 in the fourth column,
+which is 1, fixes t3 = 1, which is singular where t3 is near 0, and takes t for the centre.) Then the two-mirror model by least
+squares, started from what the rig was built to be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from hw.errors import DiscoError
+from pipeline.calibrate.projector import TwoMirrorProjector
+
+F64 = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+DRAWS, SAMPLE = 400, 8
+LEAST_SPOTS = 12
+FLAT = 0.02  # of the spots' extent: thinner than this they are nearly coplanar
+PLACE_MM, PLACE_RAD, ANGLE_SHARE = 5.0, np.deg2rad(1.0), 0.01  # what the set-up keeps to, standard deviations
+HUBER = 2.0  # in units of the spots' own scatter
+GATE = 5.0  # beyond this many scatters a spot is false
+STEPS = 15
+
+
+@dataclass(frozen=True)
+class Projection:
+    """matrix: (3, 4), homogeneous (x, y, z, 1) in mm -> steps; centre: (3,) mm; inliers: (N,)."""
+
+    matrix: F64
+    centre: F64
+    inliers: Flags
+
+    def steps(self, points: F64) -> F64:
+        """(N, 3) mm -> (N, 2) steps."""
+        u, v, w = (np.column_stack([points, np.ones(len(points))]) @ self.matrix.T).T
+        return np.column_stack([u / w, v / w])
+
+
+def dlt(points: F64, steps: F64) -> F64:
+    """(3, 4) projection matrix from (N, 3) mm and (N, 2) steps, N >= 6 (Hartley and Zisserman 2004, algorithm 7.1)."""
+    here, there = _normaliser(points), _normaliser(steps)
+    x = np.column_stack([points, np.ones(len(points))]) @ here.T
+    u, v = (np.column_stack([steps, np.ones(len(steps))]) @ there.T)[:, :2].T
+    none = np.zeros_like(x)
+    rows = np.concatenate(
+        [np.hstack([x, none, -u[:, None] * x]), np.hstack([none, x, -v[:, None] * x])]
+    )  # the fourth column of a point is 1
+    matrix = np.linalg.svd(rows, full_matrices=False)[2][-1].reshape(3, 4)
+    return np.asarray(np.linalg.inv(there) @ matrix @ here)
+
+
+def _normaliser(points: F64) -> F64:
+    """(d + 1, d + 1) similarity that brings points to mean 0 and mean distance sqrt(d)."""
+    d, mean = points.shape[1], points.mean(axis=0)
+    scale = np.sqrt(d) / max(float(np.linalg.norm(points - mean, axis=1).mean()), 1e-12)
+    out = np.eye(d + 1)
+    out[:d, :d] *= scale
+    out[:d, d] = -scale * mean
+    return out
+
+
+def projection(points: F64, steps: F64, tolerance: float, rng: np.random.Generator) -> Projection:
+    """Robust DLT: `tolerance` in steps separates true spots from false ones. Refused where it would mean nothing."""
+    require_depth(points)
+    best: Flags = np.zeros(len(points), bool)
+    for _ in range(DRAWS):
+        some = rng.choice(len(points), SAMPLE, replace=False)
+        good = _misses(dlt(points[some], steps[some]), points, steps) < tolerance
+        if good.sum() > best.sum():
+            best = good
+    for _ in range(3):
+        if best.sum() < LEAST_SPOTS:
+            raise DiscoError(
+                f"only {int(best.sum())} of {len(points)} spots agree on a projector, {LEAST_SPOTS} are needed. "
+                "Remedy: check the object's pose and the mirrors' directions"
+            )
+        require_depth(points[best])
+        matrix = dlt(points[best], steps[best])
+        best = _misses(matrix, points, steps) < tolerance
+    null = np.linalg.svd(matrix)[2][-1]
+    return Projection(matrix, null[:3] / null[3], best)
+
+
+def require_depth(points: F64) -> None:
+    """Refuse spots from which the projector's distance cannot be told."""
+    if len(points) < LEAST_SPOTS:
+        raise DiscoError(f"{len(points)} spots, {LEAST_SPOTS} are needed. Remedy: more spots per turntable angle")
+    extent = np.sqrt(np.linalg.eigvalsh(np.cov(points.T)))
+    if extent[0] < FLAT * extent[2]:
+        raise DiscoError(
+            f"the spots are nearly coplanar ({extent[0]:.3g} mm thick, {extent[2]:.3g} mm wide, standard deviations): "
+            "the projector's distance cannot be told from them. Remedy: light an object with more relief, or turn it "
+            "to light more sides of it"
+        )
+
+
+def _misses(matrix: F64, points: F64, steps: F64) -> F64:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        away = np.linalg.norm(Projection(matrix, np.zeros(3), np.zeros(0, bool)).steps(points) - steps, axis=1)
+    return np.asarray(np.where(np.isfinite(away), away, np.inf))
+
+
+@dataclass(frozen=True)
+class StepSize:
+    """full_angle_rad: (2,) over all steps; error_rad: (2,) standard deviations."""
+
+    full_angle_rad: F64
+    error_rad: F64
+
+
+def step_size(
+    points: F64, steps: F64, distance: F64, distance_error: float, projector: TwoMirrorProjector, noise: float
+) -> StepSize:
+    """The plane measurement (thesis figure 5.2). points: (N, 2) mm on the plane along the mirrors' two directions.
+
+    distance: (N,) mm from the second mirror to the plane, along the axis, at each spot. A step of angle moves the spot
+    by step * (distance + separation) along the first mirror's direction, for that mirror stands further back: the
+    thesis's 2 arctan(a / d) is too large by separation / d there.
+    """
+    angle = projector.angles(steps)
+    tangent = np.column_stack([np.tan(angle[:, 0]), np.tan(angle[:, 1])])
+    # Unfolded: x = (e + sqrt(y^2 + z^2)) tan(theta_x), y = z tan(theta_y).
+    reach = np.column_stack([projector.separation_mm + distance * np.hypot(1.0, tangent[:, 1]), distance])
+    full, error = np.empty(2), np.empty(2)
+    for k in (0, 1):
+        design = np.column_stack([reach[:, k] * tangent[:, k], np.ones(len(points))])
+        (slope, _), *_ = np.linalg.lstsq(design, points[:, k], rcond=None)
+        spread = noise / np.sqrt(((design[:, 0] - design[:, 0].mean()) ** 2).sum())
+        full[k] = projector.full_angle_rad[k] * slope
+        error[k] = projector.full_angle_rad[k] * np.hypot(spread, distance_error / distance.mean())
+    return StepSize(full, error)
+
+
+@dataclass(frozen=True)
+class ProjectorFit:
+    """covariance: (8, 8) of the pose (rotation of the object about its origin, along the projector's axes, rad; the
+    origin in the projector's frame, mm) and of the two full angles (rad)
+
+    rms_mm: of the true spots across the beam; false: (N,) spots left out
+
+    shift: (2,) mm by which a spot's peak moves along the light's way and towards the eye, per unit of the direction's
+    tangential part (Godin et al. 2001), and its standard deviations
+    """
+
+    projector: TwoMirrorProjector
+    covariance: F64
+    rms_mm: float
+    false: Flags
+    shift: F64
+    shift_error: F64
+
+
+def refine(
+    start: TwoMirrorProjector,
+    points: F64,
+    steps: F64,
+    normals: F64,
+    to_eye: F64,
+    size: StepSize | None = None,
+    group: NDArray[np.int64] | None = None,
+) -> ProjectorFit:
+    """Two-mirror model by robust least squares on what the beam's axis misses the spots by, across the beam, in mm.
+
+    start: the nominal projector, points: (N, 3) mm, all in one frame; normals, to_eye: (N, 3) unit; group: (N,) spots
+    of one group err together (default: each for itself)
+    """
+    nominal = start.full_angle_rad
+    known = StepSize(nominal, nominal * ANGLE_SHARE) if size is None else size
+    sigma = np.concatenate([[PLACE_RAD] * 3, [PLACE_MM] * 3, known.error_rad, [1.0, 1.0]])
+    target = np.concatenate([np.zeros(6), known.full_angle_rad, [0.0, 0.0]])
+    precision = np.diag(sigma**-2)
+    value = np.concatenate([np.zeros(6), nominal, [0.0, 0.0]])
+    group = np.arange(len(points)) if group is None else group
+    scatter = np.inf
+    weight = np.ones(len(points))
+    for _ in range(STEPS):
+        rest = _across(start, value, points, steps, normals, to_eye)
+        size_of = np.linalg.norm(rest, axis=1)
+        scatter = max(float(np.median(size_of)) / 1.1774, 1e-4)
+        weight = np.where(size_of > GATE * scatter, 0.0, 1.0 / np.maximum(size_of / (HUBER * scatter), 1.0))
+        j = _derivative(start, value, points, steps, normals, to_eye)
+        hessian = np.einsum("n,nkp,nkq->pq", weight, j, j) / scatter**2
+        gradient = -np.einsum("n,nkp,nk->p", weight, j, rest) / scatter**2
+        value = value + np.linalg.solve(hessian + precision, gradient + precision @ (target - value))
+    rest = _across(start, value, points, steps, normals, to_eye)
+    scores = np.zeros((group.max() + 1, len(value)))
+    np.add.at(scores, group, np.einsum("n,nkp,nk->np", weight, j, rest) / scatter**2)
+    scores = scores[np.abs(scores).sum(axis=1) > 0]
+    meat = scores.T @ scores * len(scores) / max(len(scores) - len(value), 1)
+    inverse = np.linalg.inv(hessian + precision)
+    covariance = inverse @ (meat + precision) @ inverse
+    kept = weight > 0
+    return ProjectorFit(
+        _moved(start, value),
+        covariance[:8, :8],
+        float(np.sqrt((rest[kept] ** 2).sum(axis=1).mean())) if kept.any() else np.inf,
+        ~kept,
+        value[8:],
+        np.sqrt(np.diag(covariance)[8:]),
+    )
+
+
+def _moved(start: TwoMirrorProjector, value: F64) -> TwoMirrorProjector:
+    pose = start.pose.copy()
+    pose[:3, :3] = Rotation.from_rotvec(value[:3]).as_matrix() @ pose[:3, :3]
+    pose[:3, 3] += value[3:6]
+    return replace(start, pose=pose, full_angle_rad=value[6:8])
+
+
+def _across(start: TwoMirrorProjector, value: F64, points: F64, steps: F64, normals: F64, to_eye: F64) -> F64:
+    """(N, 2) mm from the beam's axis to the spots, in two fixed directions across it; the peak's shift is taken off."""
+    projector = _moved(start, value)
+    origin, way = projector.rays(steps)
+    true = points - value[8] * _tangential(way, normals) - value[9] * _tangential(to_eye, normals)
+    right, down = projector.pose[0, :3], projector.pose[1, :3]
+    away = true - origin
+    away = away - (away * way).sum(axis=1, keepdims=True) * way
+    return np.column_stack([away @ right, away @ down])
+
+
+def _tangential(direction: F64, normals: F64) -> F64:
+    return np.asarray(direction - (direction * normals).sum(axis=1, keepdims=True) * normals)
+
+
+def _derivative(start: TwoMirrorProjector, value: F64, points: F64, steps: F64, normals: F64, to_eye: F64) -> F64:
+    """(N, 2, P) of `_across` by the unknowns, central differences."""
+    columns = []
+    for k in range(len(value)):
+        h = 1e-5 if k < 3 or 6 <= k < 8 else 1e-3
+        step = np.zeros(len(value))
+        step[k] = h
+        ahead, behind = (_across(start, value + s * step, points, steps, normals, to_eye) for s in (1, -1))
+        columns.append((ahead - behind) / (2 * h))
+    return np.stack(columns, axis=2)

@@ -1,0 +1,97 @@
+"""Images for the tests of the calibration: an irregular object and boards before seeded rigs, without the renderer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+from disco_twin.camera.lars3 import Lars3, lars3_sensor
+from disco_twin.camera.targets import TargetSource
+from disco_twin.deviation import ActualRig, actual_rig
+from disco_twin.faults import Stream, generator
+from disco_twin.scene import load_scene
+from disco_twin.world import World
+from hw.record import to_radiance
+from pipeline.calibrate.camera import PinholeCamera
+from pipeline.capture.targets import Targets, make_targets
+from pipeline.rig import RigConfig
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+QUICK = Path(__file__).parents[2] / "scenes" / "quick.toml"
+
+
+@cache
+def world() -> World:
+    """The quick scene."""
+    return World(load_scene(QUICK))
+
+
+def faulty_rig(width: int = 192, angles: tuple[float, ...] = (0.0, 120.0, 240.0)) -> RigConfig:
+    """The quick scene's rig with deviation and flare; 768 gives the Lars III's own resolution."""
+    rig = world().scene.rig
+    faults = rig.faults.model_copy(update={"deviation": True, "flare": True})
+    cameras = tuple(
+        c.model_copy(update={"width": width, "height": width * 124 // 192, "pixel_pitch_um": 44.0 * 192 / width})
+        for c in rig.cameras
+    )
+    return rig.model_copy(update={"faults": faults, "cameras": cameras, "turntable_angles_deg": angles})
+
+
+def photograph(rig: RigConfig, camera: PinholeCamera, radiance: F32, seed: int) -> F32:
+    """(H, W) radiance through the twin's lens and sensor, as the pipeline reads it."""
+    raw = Lars3.of(rig, camera).expose(radiance, 0, generator(seed, Stream.SENSOR, 99))
+    return to_radiance(raw, lars3_sensor(rig), 0).radiance
+
+
+def floodlit(mesh: trimesh.Trimesh, camera: PinholeCamera, supersample: int = 4) -> F32:
+    """(H, W) what `disco_twin.light.response.floodlit` shows, without the renderer."""
+    s = supersample
+    origins, directions = camera.rays(camera.pixel_centres(s))
+    triangle = RayMeshIntersector(mesh).intersects_first(origins, directions)
+    cosine = np.abs((mesh.face_normals[np.maximum(triangle, 0)] * directions).sum(axis=1))
+    shade = np.where(triangle >= 0, 0.3 + 0.7 * cosine, 0.0) * 2e-5
+    return np.asarray(shade.reshape(camera.height, s, camera.width, s).mean(axis=(1, 3)), np.float32)
+
+
+@dataclass(frozen=True)
+class Silhouettes:
+    """images and truth: per view; lenses: per camera the actual lens at the nominal place."""
+
+    images: list[F32]
+    truth: list[PinholeCamera]
+    lenses: list[PinholeCamera]
+    angles: list[float]
+    actual: ActualRig
+
+
+def silhouettes(seed: int, mesh: trimesh.Trimesh, rig: RigConfig | None = None) -> Silhouettes:
+    """Every view of a seeded rig."""
+    rig = rig or faulty_rig()
+    actual = actual_rig(rig, seed)
+    views = [actual.camera(c, j) for c in range(len(rig.cameras)) for j in range(len(rig.turntable_angles_deg))]
+    images = [photograph(rig, view, floodlit(mesh, view), 1000 * seed + k) for k, view in enumerate(views)]
+    lenses = []
+    for config, real in zip(rig.cameras, actual.cameras, strict=True):
+        nominal = PinholeCamera.from_config(config)
+        lenses.append(replace(nominal, focal=real.focal, centre=real.centre, distortion=real.distortion))
+    return Silhouettes(images, views, lenses, [float(a) for a in np.deg2rad(rig.turntable_angles_deg)], actual)
+
+
+def boards(seed: int, rig: RigConfig, camera: int) -> tuple[Targets, list[F32], PinholeCamera]:
+    """Photographs of all boards by one camera of a seeded rig, and the camera as it is."""
+    actual = actual_rig(rig, seed)
+    targets, _ = make_targets(rig, camera)
+    source = TargetSource(targets, actual.cameras[camera], actual, rig.projector.beam_diameter_mm / 2)
+    images = [
+        photograph(rig, actual.cameras[camera], source.silhouette(camera, i), 1000 * seed + i)
+        for i, p in enumerate(targets.placements)
+        if p.kind == "board"
+    ]
+    return targets, images, actual.cameras[camera]
