@@ -235,7 +235,7 @@ def _fine(
         variance = float((weight * rest**2).sum() / weight.sum())
         hessian = j.T @ (j * weight[:, None]) / variance
         step = np.linalg.solve(hessian + precision, j.T @ (weight * rest) / variance - precision @ total)
-        sweep, total = sweep.moved(step), total + step
+        sweep, total = sweep.moved(step), np.asarray(total + step)
     scores = np.zeros((sector.max(initial=0) + 1, sweep.size))
     np.add.at(scores, sector, j * (weight * (rest - j @ step) / variance)[:, None])
     scores = scores[np.abs(scores).sum(axis=1) > 0]

@@ -2,7 +2,7 @@
 
 First the projection matrix: homogeneous DLT by SVD with Hartley's normalisation, drawn many times from few spots so
 that false ones do not matter; the centre is the matrix's null vector. (The thesis prints 1, 2, 3 in the fourth column,
-which is 1, fixes t3 = 1, which is singular where t3 is near 0, and takes t for the centre.) Then the two-mirror model by least
+which is 1, fixes t3 = 1, singular where t3 is near 0, and takes t for the centre.) Then the two-mirror model by least
 squares, started from what the rig was built to be.
 """
 
