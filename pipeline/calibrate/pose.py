@@ -179,7 +179,7 @@ def _coarse(start: _Sweep, masks: Sequence[NDArray[np.bool_]], mesh: trimesh.Tri
                 hessian = hessian + j.T @ (j * weight[:, None])
                 gradient = gradient - j.T @ (weight * away)
             step = np.linalg.solve(hessian + 1e-9 * np.diag(np.diag(hessian)), gradient)
-            sweep, total = sweep.moved(step), total + step
+            sweep, total = sweep.moved(step), np.asarray(total + step)
             if np.abs(step[: 6 + LENS][:3]).max() < 2e-4:
                 break
         wrong = sum(int((mesh_mask(mesh, sweep.view(v)) ^ m).sum()) for v, m in enumerate(masks))
