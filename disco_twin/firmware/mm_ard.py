@@ -44,6 +44,7 @@ class MirrorHead:
     lines: int = 0
     pattern: int = 0
     blanking: bool = False
+    blank_on_high: bool = False
 
     def settled(self, now: float) -> bool:
         """Whether both mirrors stand still."""
@@ -56,14 +57,16 @@ class MirrorHead:
             self.galvos[0 if channel == 0 else 1].aim(value, now)
 
     def set_pattern(self, pattern: int) -> None:
-        """The TTL pattern; blanked while the trigger input is low, which nothing is plugged into."""
+        """The TTL pattern."""
         self.pattern = pattern & (1 << LINES) - 1
-        self.lines = 0 if self.blanking else self.pattern
+        if not self.blanking:
+            self.lines = self.pattern
+        self.follow_trigger()
 
-    def blank(self, on: bool) -> None:
-        """Blanking mode."""
-        self.blanking = on
-        self.set_pattern(self.pattern)
+    def follow_trigger(self) -> None:
+        """Blanking mode: the trigger input, which nothing is plugged into, is low. Leaving it changes no line."""
+        if self.blanking:
+            self.lines = self.pattern if self.blank_on_high else 0
 
 
 class MmArdFirmware:
@@ -81,7 +84,7 @@ class MmArdFirmware:
         """Opening the port resets the board: its lines fall, the DAC keeps its values."""
         self._command.clear()
         self._ready = now + BOOT_S
-        self.head.blanking = False
+        self.head.blanking = self.head.blank_on_high = False
         self.head.set_pattern(0)
 
     def power_cycle(self, now: float) -> None:
@@ -121,9 +124,12 @@ class MmArdFirmware:
                 head.write(channel, high << 8 | low, now)
                 return bytes([3, channel, high, low])
             case 20 | 21:
-                head.blank(command == 20)
+                head.blanking = command == 20
+                head.follow_trigger()
                 return bytes([command])
             case 22:
+                head.blank_on_high = arguments[0] == 0
+                head.follow_trigger()
                 return bytes([22])
             case 30:
                 return b"MM-Ard\r\n"

@@ -17,6 +17,7 @@ from hw.clock import Clock
 Timed = tuple[float, bytes]  # seconds from now, bytes of one message
 Fault = Callable[[bytes], list[Timed]]  # what becomes of an answer
 
+TICK_S = 1e-9  # the shortest wait: a sum of times may fall short of the time that it was meant to reach
 BITS_PER_BYTE = 10  # start, eight bits, stop
 
 
@@ -107,7 +108,7 @@ class Line:
 
     def say(self, data: bytes) -> None:
         """The device says something unasked."""
-        self._send([(0.0, data)])
+        self._send([(0.0, data)], self.clock.now())
 
     def _forget(self) -> None:
         self._coming.clear()
@@ -138,10 +139,10 @@ class Line:
         fault = self.command_faults.popleft() if self.command_faults else None
         if fault is not None:
             data = fault(data)
-        self._send(self.firmware.feed(data, self.clock.now() + self._duration(data)))
+        arrived = self.clock.now() + self._duration(data)
+        self._send(self.firmware.feed(data, arrived), arrived)
 
-    def _send(self, answers: list[Timed]) -> None:
-        now = self.clock.now()
+    def _send(self, answers: list[Timed], now: float) -> None:
         for delay, data in answers:
             fault = self.answer_faults.popleft() if self.answer_faults else None
             for more, piece in [(0.0, data)] if fault is None else fault(data):
@@ -170,10 +171,9 @@ class Line:
 
     def deliver(self, size: int, timeout_s: float) -> bytes:
         """At most `size` bytes; lets the clock go on to the first of them, or to the timeout."""
-        if not self.waiting():
-            now = self.clock.now()
-            self.clock.sleep(min(timeout_s, max(0.0, self.next_arrival() - now)))
-            self.waiting()
+        end = self.clock.now() + timeout_s
+        while not self.waiting() and (now := self.clock.now()) < end:
+            self.clock.sleep(max(min(end, self.next_arrival()) - now, TICK_S))
         data = bytes(self._arrived[:size])
         del self._arrived[:size]
         return data

@@ -150,6 +150,10 @@ class MirrorBoard:
         """Every line low."""
         self.set_lines(0)
 
+    def shut_now(self) -> None:
+        """Say so without waiting for anything, first of all when something is wrong."""
+        self.link.write(bytes([*RESTART, SET_LINES, 0]))
+
     def lines(self) -> int:
         """The TTL lines as they are."""
         return self._exchange(bytes([GET_LINES]), bytes([GET_LINES]), 1)[0] & (1 << LINES) - 1

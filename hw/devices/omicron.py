@@ -332,6 +332,11 @@ class OmicronLaser:
                 raise NoAnswer(self.link.url, self.name, problem, "check key switch, interlock and enable pin")
             clock.sleep(POLL_S)
 
+    def off_now(self) -> None:
+        """Say LOf without waiting for anything, first of all when something is wrong; the CR ends what was begun."""
+        self._owed.add("LOf")
+        self.link.write(b"\r?LOf\r")
+
     def stop_emission(self) -> None:
         """Switch the light off; it takes seconds to come back. May be asked for at any time."""
         self._set("LOf")

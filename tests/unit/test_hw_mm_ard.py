@@ -26,7 +26,7 @@ def positions(bench: BoardBench) -> tuple[float, ...]:
 def test_connecting_waits_for_the_board_and_shuts_its_lines() -> None:
     bench = BoardBench()
     bench.head.set_pattern(0b111)
-    bench.head.blank(on=True)
+    bench.head.blanking = True
     board = bench.connect()
     assert board.version == 5
     assert BOOT_S <= bench.now() < BOOT_S + 0.2
@@ -149,6 +149,31 @@ def test_shutting_works_wherever_the_parser_is(unfinished: bytes) -> None:
     firmware.feed(unfinished, 10.0)
     firmware.feed(bytes([0, 0, 0, 1, 0]), 10.1)
     assert head.lines == 0
+
+
+def test_shut_now_waits_for_nothing() -> None:
+    bench = BoardBench()
+    board = bench.connect()
+    for unfinished in (b"", b"\1", b"\3\0", b"\x29"):
+        board.set_lines(0b11)
+        board.link.write(unfinished)
+        before = bench.now()
+        board.shut_now()
+        assert bench.now() == before
+        assert bench.head.lines == 0
+        board.set_mirrors(3, 4)
+        assert positions(bench) == (3, 4)
+
+
+def test_leaving_blanking_mode_restores_no_line() -> None:
+    """As the published firmware does: PORTB changes with the next pattern only."""
+    head = MirrorHead()
+    firmware = MmArdFirmware(head)
+    lines = []
+    for command in (b"\1\7", b"\x14", b"\2", b"\x16\0", b"\x16\1", b"\x15", b"\1\7"):
+        firmware.feed(command, 10.0)
+        lines.append(head.lines)
+    assert lines == [7, 0, 0, 7, 0, 0, 7]
 
 
 def test_lines_that_do_not_follow_are_noticed() -> None:

@@ -195,6 +195,18 @@ def test_reading_and_setting_survive_a_bad_line(name: str, place: int) -> None:
     assert bench.head.emission(bench.now()) == pytest.approx(0.4)
 
 
+def test_off_now_waits_for_nothing_and_its_answer_answers_nothing_else() -> None:
+    bench = LaserBench()
+    laser = emitting(bench)
+    laser.link.write(b"?MD")  # cut short
+    before = bench.now()
+    laser.off_now()
+    assert bench.now() == before
+    assert bench.head.emission(bench.now()) == 0.0
+    assert laser.ask("GSN") == "4711"
+    laser.force_off()
+
+
 def test_a_lost_command_is_given_again() -> None:
     bench = LaserBench()
     laser = emitting(bench)

@@ -1,0 +1,46 @@
+"""The shipped scene, captured through drivers, protocols and emulated firmware."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from disco_twin.deviation import actual_rig
+from disco_twin.firmware.emulate import Emulation
+from disco_twin.rig import TwinRig
+from disco_twin.scene import load_scene
+from disco_twin.world import World
+from hw.bytelog import read_log
+from pipeline.capture.files import IMAGES, JOURNAL, PLAN
+from pipeline.capture.loop import capture
+
+pytestmark = pytest.mark.slow
+
+
+def test_quick_through_serial_lines_equals_the_direct_twin(repository: Path, tmp_path: Path) -> None:
+    """Rationale: between the capture loop and the twin lie five protocols; none may change an image or its record.
+
+    Expected behaviour: 1806 images, and the three files of the stream are the same bytes; no light while anything
+    moves, never two lasers at once.
+    """
+    world = World(load_scene(repository / "scenes" / "quick.toml"))
+    scene, transport = world.scene, world.transport
+    from disco_twin.light.response import SpotResponses
+
+    actual = actual_rig(scene.rig, scene.seed)
+
+    def twin() -> TwinRig:
+        walks, light = scene.simulation.walks_per_spot, tmp_path / "light"
+        responses = SpotResponses(transport, scene.rig, actual, walks, world.seed("spots"), light)
+        return TwinRig(scene.rig, responses, scene.seed, actual)
+
+    direct, serial = tmp_path / "direct", tmp_path / "serial"
+    assert capture(twin(), world.plan, direct).images == 1806
+    emulated = Emulation(twin())
+    capture(emulated.serial_rig(tmp_path / "logs"), world.plan, serial)
+    for name in (IMAGES, JOURNAL, PLAN):
+        assert (serial / name).read_bytes() == (direct / name).read_bytes(), name
+    assert emulated.bench.hazards == []
+    sent = [event for event in read_log(tmp_path / "logs" / "board.log") if event.mark == ">"]
+    assert len(sent) > 10 * 1800  # it did go through the line
