@@ -87,7 +87,7 @@ class Line:
         self.plugged = True
         self._users = 0  # an old handle may be closed after a new one was opened
         self._coming: list[Timed] = []  # by the time at which the device begins to send them
-        self._free = self._held_until = -math.inf
+        self._free = self._held_until = self._taken = -math.inf
         self._arrived = bytearray()
 
     # ---- what a test or a user does to it
@@ -113,7 +113,7 @@ class Line:
     def _forget(self) -> None:
         self._coming.clear()
         self._arrived.clear()
-        self._free = self._held_until = -math.inf
+        self._free = self._held_until = self._taken = -math.inf
 
     # ---- the computer's side
 
@@ -139,7 +139,7 @@ class Line:
         fault = self.command_faults.popleft() if self.command_faults else None
         if fault is not None:
             data = fault(data)
-        arrived = self.clock.now() + self._duration(data)
+        arrived = self._taken = max(self.clock.now(), self._taken) + self._duration(data)
         self._send(self.firmware.feed(data, arrived), arrived)
 
     def _send(self, answers: list[Timed], now: float) -> None:

@@ -68,6 +68,7 @@ def test_commands_of_an_image_fit_into_the_discarded_frame() -> None:
         for u in (1900, 4095, 0):
             start = clock.now()
             rig.projector.move(u, 2000)
+            assert emulated.bench.board.settled(clock.now())
             rig.lasers[0].open_gate()
             rig.cameras[0].expose()
             rig.photodiode.read()

@@ -165,6 +165,20 @@ def test_shut_now_waits_for_nothing() -> None:
         assert positions(bench) == (3, 4)
 
 
+@pytest.mark.parametrize("unfinished", [b"\1", b"\3", b"\3\0", b"\3\0\7", b"\x29", b"\x16"])
+def test_the_first_write_of_a_shut_has_shut(unfinished: bytes) -> None:
+    """However long the driver then takes to get back into step."""
+    bench = BoardBench()
+    board = bench.connect()
+    board.set_lines(0b11)
+    board.link.write(unfinished)
+    seen = []
+    bench.line.answer_faults.extend([lambda data: (seen.append(bench.head.lines), [(0.0, data)])[1]] * 9)
+    board.shut()
+    assert seen[0] == 0
+    assert bench.head.lines == 0
+
+
 def test_leaving_blanking_mode_restores_no_line() -> None:
     """As the published firmware does: PORTB changes with the next pattern only."""
     head = MirrorHead()
