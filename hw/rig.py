@@ -31,6 +31,7 @@ class Head(Protocol):
     def name(self) -> str: ...
     def arm(self, power_mw: float) -> None: ...
     def emit(self) -> None: ...
+    def require_power(self, tolerance: float) -> None: ...
     def force_off(self) -> None: ...
     def close(self) -> None: ...
 
@@ -40,6 +41,7 @@ class Board(Protocol):
 
     def set_mirrors(self, u: int, v: int) -> None: ...
     def set_lines(self, pattern: int) -> None: ...
+    def lines(self) -> int: ...
     def shut(self) -> None: ...
     def counts(self, pin: int) -> int: ...
     def close(self) -> None: ...
@@ -109,13 +111,23 @@ class SerialRig:
         clock: Clock,
         *,
         flood_line: int | None = None,
+        armed_line: int | None = None,
+        warm_up_s: float = 0.0,
+        power_tolerance: float = 0.1,
         timebase: Timebase | None = None,
         announce: Callable[[Sequence[Aim]], None] | None = None,
         centre: tuple[int, int] = (2048, 2048),
     ) -> None:
-        """`connect` closes what it has opened if it fails. `centre`: where the mirrors stand at first."""
+        """`connect` closes what it has opened if it fails. `centre`: where the mirrors stand at first.
+
+        armed_line: a TTL line that is high as long as the rig is on: a warning lamp, and the witness that the board has
+        not been reset since (it would have forgotten where the mirrors stand). warm_up_s: from emission to the first
+        image; then every laser's own reading must lie within `power_tolerance` of its set point.
+        """
         self._connect, self.wiring, self.clock = connect, tuple(wiring), clock
         self.flood_line, self._announce, self._centre = flood_line, announce, centre
+        self._armed = 0 if armed_line is None else 1 << armed_line
+        self._warm_up_s, self._power_tolerance = warm_up_s, power_tolerance
         self._timebase: Timebase = Elapsed(clock) if timebase is None else timebase
         self._devices: Devices | None = None
         self._pattern, self._last_open = 0, -1
@@ -140,6 +152,12 @@ class SerialRig:
             for head, wiring in zip(devices.heads, self.wiring, strict=True):
                 head.arm(wiring.power_mw)
                 head.emit()
+            if self._armed:
+                devices.board.set_lines(self._armed)
+                self._pattern = self._armed
+            self.clock.sleep(self._warm_up_s)
+            for head in devices.heads:
+                head.require_power(self._power_tolerance)
         except BaseException:
             self.make_safe()
             raise
@@ -201,6 +219,10 @@ class SerialRig:
         """The laser whose gate is open, or -1."""
         return next((i for i, w in enumerate(self.wiring) if self._pattern >> w.gate_line & 1), -1)
 
+    def lit(self, line: int) -> bool:
+        """Whether a line is switched on."""
+        return bool(self._pattern >> line & 1)
+
     def switch(self, line: int, on: bool) -> None:
         """One line, the others as they are. A line that may have been switched counts as on."""
         board, before = self.devices().board, self._pattern
@@ -208,6 +230,13 @@ class SerialRig:
         self._pattern = before | after
         board.set_lines(after)
         self._pattern = after
+
+    def require_lines(self) -> None:
+        """Refuse an image during which the board was reset: gates and mirrors have moved."""
+        found = self.devices().board.lines()
+        if found != self._pattern:
+            problem = f"has its TTL lines at {found:06b} instead of {self._pattern:06b}: it was reset"
+            raise DeviceFault("board", "the mirror board", problem, "check its power supply, then repeat the command")
 
     def require_dark(self, what: str) -> None:
         """Refuse to move anything while laser light is let out."""
@@ -287,8 +316,9 @@ class AdcPhotodiode:
         board, laser = self.rig.devices().board, self.rig.last_open
         if laser < 0:
             return 0.0
+        self.rig.require_lines()
         wiring = self.rig.wiring[laser]
-        counts = board.counts(wiring.pin)
+        counts = sorted(board.counts(wiring.pin) for _ in range(3))[1]  # its protocol has no checksum
         watts = counts * wiring.watts_per_count
         low, high = wiring.limits
         if self.rig.open_gate == laser and (counts >= ADC_TOP or not low <= watts / (wiring.power_mw * 1e-3) <= high):
@@ -315,6 +345,12 @@ class TtlFloodlight:
         self.rig.switch(self.rig.flood_line, True)
 
     def off(self) -> None:
-        """Switch off; always allowed."""
-        if self.rig.flood_line is not None and self.rig.connected:
-            self.rig.switch(self.rig.flood_line, False)
+        """Switch off; always allowed. Refuses the image if the light had gone out before."""
+        line = self.rig.flood_line
+        if line is None or not self.rig.connected:
+            return
+        try:
+            if self.rig.lit(line):
+                self.rig.require_lines()
+        finally:
+            self.rig.switch(line, False)

@@ -337,6 +337,13 @@ class OmicronLaser:
         self._owed.add("LOf")
         self.link.write(b"\r?LOf\r")
 
+    def require_power(self, tolerance: float) -> None:
+        """Refuse a laser whose own reading is not its set point within this share."""
+        measured = self.measured_mw()
+        if not abs(measured - self.armed_mw) <= tolerance * self.armed_mw:
+            problem = f"emits {measured:.2f} mW instead of {self.armed_mw:g} mW (allowed: {100 * tolerance:g} % off)"
+            raise DeviceFault(self.link.url, self.name, problem, "let it warm up longer, or have the laser serviced")
+
     def stop_emission(self) -> None:
         """Switch the light off; it takes seconds to come back. May be asked for at any time."""
         self._set("LOf")
