@@ -1,0 +1,363 @@
+"""From a rig file to a rig: real devices on their ports, emulated ones on memory ports, cameras real or simulated.
+
+Emulated devices move the twin by themselves. What a real device does is told to the twin where cameras are simulated
+(`followed`), so that they see it: a real turntable turns the simulated object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from disco_twin.firmware.bench import Bench
+from disco_twin.firmware.turning import Spindle
+from disco_twin.rig_file import EMULATED, GenicamDevice, LaserDevice, RigFile, SensorDevice, ZaberDevice
+from hw.bytelog import ByteLog
+from hw.clock import Clock, VirtualClock, WallClock
+from hw.devices.elliptec import BAUD as ELLIPTEC_BAUD
+from hw.devices.elliptec import ElliptecTable
+from hw.devices.mm_ard import BAUD as BOARD_BAUD
+from hw.devices.mm_ard import LINES, MirrorBoard
+from hw.devices.omicron import Mode, OmicronLaser
+from hw.devices.turning import Table
+from hw.devices.zaber import BAUD as ZABER_BAUD
+from hw.devices.zaber import ZaberTable
+from hw.errors import DeviceFault, InputError
+from hw.interface import Camera
+from hw.ports.protocol_memory import attach
+from hw.rig import Board, Devices, Head, LaserWiring, SerialRig
+from hw.serial_link import Link
+from pipeline.rig import RigConfig
+
+if TYPE_CHECKING:
+    from disco_twin.firmware.emulate import Emulation
+    from disco_twin.rig import TwinRig
+    from hw.devices.genicam import GenicamCamera
+
+T = TypeVar("T")
+
+
+# ---- limits of the rig file
+
+
+@dataclass
+class LimitedBoard:
+    """A board whose mirrors stay where the rig file lets them."""
+
+    board: MirrorBoard
+    limits: tuple[tuple[int, int], tuple[int, int]]
+
+    def set_mirrors(self, u: int, v: int) -> None:
+        """Refused outside the limits."""
+        for name, value, (low, high) in zip("uv", (u, v), self.limits, strict=True):
+            if not low <= value <= high:
+                raise InputError(
+                    "this mirror step is outside the rig's limits",
+                    key=f"board.limits_{name}",
+                    value=value,
+                    allowed=f"{low} to {high}",
+                    remedy="widen the limits in the rig file, or aim the scene's projector so that it needs less",
+                )
+        self.board.set_mirrors(u, v)
+
+    def set_lines(self, pattern: int) -> None:
+        """The TTL lines."""
+        self.board.set_lines(pattern)
+
+    def lines(self) -> int:
+        """The TTL lines as they are."""
+        return self.board.lines()
+
+    def shut(self) -> None:
+        """Every line low."""
+        self.board.shut()
+
+    def counts(self, pin: int) -> int:
+        """The converter's value at a pin."""
+        return self.board.counts(pin)
+
+    def close(self) -> None:
+        """Shut, and give the port back."""
+        self.board.close()
+
+
+@dataclass
+class PlacedTable:
+    """A turntable whose own zero and sense of turning differ from the rig's. Angles in rad."""
+
+    table: Table
+    zero_rad: float
+    direction: int
+    told: Callable[[float], None]  # degrees of the rig, after every move
+
+    def __post_init__(self) -> None:
+        self.link = self.table.link
+
+    def home(self) -> None:
+        """Find the zero, and turn to the rig's."""
+        self.table.home()
+        self.move(0.0)
+
+    def move(self, angle_rad: float) -> None:
+        """Turn to an angle of the rig."""
+        self.table.move(self.zero_rad + self.direction * angle_rad)
+        self.told(float(np.rad2deg(angle_rad)))
+
+    def angle_rad(self) -> float:
+        """Where it stands."""
+        return self.direction * (self.table.angle_rad() - self.zero_rad) % (2 * np.pi)
+
+    def stop(self) -> None:
+        """Stop at once."""
+        self.table.stop()
+
+    def close(self) -> None:
+        """Give the port back."""
+        self.table.close()
+
+
+# ---- real devices that simulated cameras must see
+
+
+@dataclass
+class FollowedHead:
+    """A real laser; the twin's head does as it does."""
+
+    head: OmicronLaser
+    bench: Bench
+    index: int
+
+    @property
+    def name(self) -> str:
+        """What the rig calls it."""
+        return self.head.name
+
+    def arm(self, power_mw: float) -> None:
+        """Allow light of this power."""
+        self.head.arm(power_mw)
+        twin = self.bench.heads[self.index]
+        twin.level = power_mw / twin.max_power_mw
+        twin.mode = int(Mode.BIAS | Mode.RELEASE)
+
+    def emit(self) -> None:
+        """Start emission."""
+        self.head.emit()
+        self.bench.heads[self.index].on_since = -np.inf
+
+    def require_power(self, tolerance: float) -> None:
+        """The real laser's own reading."""
+        self.head.require_power(tolerance)
+
+    def force_off(self) -> None:
+        """No light."""
+        self.bench.heads[self.index].on_since = None
+        self.head.force_off()
+
+    def close(self) -> None:
+        """Switch off, and give the port back."""
+        self.bench.heads[self.index].on_since = None
+        self.head.close()
+
+
+@dataclass
+class FollowedBoard(LimitedBoard):
+    """A real board; the twin's mirrors and gates do as it does."""
+
+    bench: Bench
+
+    def set_mirrors(self, u: int, v: int) -> None:
+        """Both mirrors."""
+        super().set_mirrors(u, v)
+        for channel, value in enumerate((u, v)):
+            self.bench.board.write(channel, value, self.bench.clock.now())
+
+    def set_lines(self, pattern: int) -> None:
+        """The TTL lines."""
+        super().set_lines(pattern)
+        self.bench.board.set_pattern(pattern)
+
+    def shut(self) -> None:
+        """Every line low."""
+        self.bench.board.set_pattern(0)
+        super().shut()
+
+
+def _turn_twin(bench: Bench) -> Callable[[float], None]:
+    """The twin's object stands where a real turntable has put it."""
+
+    def told(angle_deg: float) -> None:
+        bench.spindle = Spindle(angle_deg=angle_deg, homed=True, on_move=bench.turned)
+        bench.turned(angle_deg)
+
+    return told
+
+
+# ---- putting it together
+
+
+class Connector:
+    """Opens what a rig file names. `emulation` has the devices that are emulated, and the twin that real ones move."""
+
+    def __init__(self, file: RigFile, clock: Clock, emulation: Emulation | None, logs: Path | None) -> None:
+        self.file, self.clock, self.emulation, self.logs = file, clock, emulation, logs
+        self._follow = file.simulated_cameras
+        lines = {} if emulation is None else emulation.lines
+        self._urls = {name: attach(f"rig-{id(self)}-{name}", line) for name, line in lines.items()}
+
+    def link(self, port: str, baud: int, device: str, name: str, guarded: bool = False) -> Link:
+        """A device's link. `name` is that of its emulated line and of its byte log."""
+        if port == EMULATED:
+            url = self._urls[name]
+        else:
+            url = f"guard://{port}" if guarded else port
+        return Link(url, baud, device, self.clock, None if self.logs is None else ByteLog(self.logs / f"{name}.log"))
+
+    def laser(self, index: int) -> Head:
+        """A laser's driver; connecting switches it off."""
+        device = self.file.lasers[index]
+        name = f"laser {device.wavelength_nm:g} nm"
+        link = self.link(device.port, device.baud, name, f"laser{index}", guarded=True)
+        head = _opened(link, lambda: OmicronLaser(link, device.wavelength_nm))
+        if device.port == EMULATED or not self._follow or self.emulation is None:
+            return head
+        return FollowedHead(head, self.emulation.bench, index)
+
+    def board(self) -> Board:
+        """The board's driver; connecting shuts every line."""
+        device = self.file.board
+        link = self.link(device.port, BOARD_BAUD, "mirror board", "board")
+        board, limits = _opened(link, lambda: MirrorBoard(link)), (device.limits_u, device.limits_v)
+        if device.port == EMULATED or not self._follow or self.emulation is None:
+            return LimitedBoard(board, limits)
+        return FollowedBoard(board, limits, self.emulation.bench)
+
+    def table(self) -> Table:
+        """The turntable's driver."""
+        device = self.file.turntable
+        baud = ZABER_BAUD if isinstance(device, ZaberDevice) else ELLIPTEC_BAUD
+        link = self.link(device.port, baud, "turntable", "turntable")
+
+        def driver() -> Table:
+            if isinstance(device, ZaberDevice):
+                return ZaberTable(link, device.microsteps_per_deg, device.reach_s, device.device, device.axis)
+            return ElliptecTable(link, device.address, device.reach_s)
+
+        table = _opened(link, driver)
+        follow = device.port != EMULATED and self._follow and self.emulation is not None
+        told = _turn_twin(self.emulation.bench) if follow and self.emulation is not None else _nobody
+        return PlacedTable(table, float(np.deg2rad(device.zero_deg)), device.direction, told)
+
+    def connect(self) -> Devices:
+        """All of them, or none. The lasers first: connecting switches them off."""
+        with ExitStack() as opened:
+            heads = []
+            for index in range(len(self.file.lasers)):
+                heads.append(self.laser(index))
+                opened.callback(heads[-1].close)
+            board = self.board()
+            opened.callback(board.close)
+            table = self.table()
+            opened.pop_all()
+        return Devices(heads, board, table)
+
+
+def _nobody(angle_deg: float) -> None:
+    """No simulated camera looks."""
+
+
+def _opened(link: Link, driver: Callable[[], T]) -> T:
+    """A driver on its link; the link is closed if the driver refuses the device."""
+    try:
+        return driver()
+    except BaseException:
+        link.close()
+        raise
+
+
+def wiring_of(laser: LaserDevice) -> LaserWiring:
+    """The rig file's words in the rig's."""
+    return LaserWiring(
+        laser.wavelength_nm,
+        laser.power_mw,
+        laser.gate_line,
+        laser.photodiode_pin,
+        laser.watts_per_count,
+        laser.photodiode_limits,
+    )
+
+
+def open_camera(device: GenicamDevice, sensor: SensorDevice, shape: tuple[int, int]) -> GenicamCamera:
+    """A GenICam camera that makes the bracket's exposures. shape: (height, width)."""
+    from hw.devices.genicam import GenicamCamera
+    from hw.devices.viva import VivaGrabber
+
+    grabber = VivaGrabber(device.address, device.pixel_format, shape, serial=device.serial)
+    camera = GenicamCamera(device.name, grabber, sensor.bracket(), shape)
+    try:
+        camera.check()
+    except BaseException:
+        camera.close()
+        raise
+    return camera
+
+
+def require_black(camera: GenicamCamera, sensor: SensorDevice) -> float:
+    """Measure the black level in the dark rig; refuse one that is not the rig file's: tails of R_d drown in it."""
+    mean, _ = camera.black_level()
+    if not abs(mean - sensor.black_dn) <= sensor.black_tolerance_dn:
+        problem = (
+            f"shows {mean:.1f} in the dark instead of {sensor.black_dn:g} (allowed: {sensor.black_tolerance_dn:g} off)"
+        )
+        remedy = "cover the rig; if it is dark, correct sensor.black_dn in the rig file"
+        raise DeviceFault(camera.grabber.identity(), f"camera {camera.name}", problem, remedy)
+    return mean
+
+
+@contextmanager
+def assembled(
+    file: RigFile, scene: RigConfig, twin: TwinRig | None = None, logs: Path | None = None
+) -> Iterator[SerialRig]:
+    """The rig, its cameras open. `twin`: where something is emulated or simulated; its cameras are used or not."""
+    from disco_twin.firmware.emulate import Emulation
+
+    clock: Clock = VirtualClock() if file.all_emulated and file.simulated_cameras else WallClock()
+    emulation = None if twin is None else Emulation(twin, clock)
+    if emulation is None and (file.simulated_cameras or EMULATED in file.ports().values()):
+        raise InputError("emulated devices and simulated cameras need a twin")
+    if logs is not None:
+        logs.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as opened:
+        cameras: list[Camera] = []
+        if emulation is not None and file.simulated_cameras:
+            cameras = list(emulation.bench.cameras)
+        else:
+            for device, nominal in zip(file.cameras, scene.cameras, strict=True):
+                assert isinstance(device, GenicamDevice) and file.sensor is not None  # the rig file's own check
+                camera = open_camera(device, file.sensor, (nominal.height, nominal.width))
+                opened.callback(camera.close)
+                require_black(camera, file.sensor)
+                cameras.append(camera)
+        yield SerialRig(
+            Connector(file, clock, emulation, logs).connect,
+            [wiring_of(laser) for laser in file.lasers],
+            cameras,
+            clock,
+            flood_line=file.board.floodlight_line,
+            armed_line=free_line(file),
+            warm_up_s=file.warm_up_s,
+            power_tolerance=file.power_tolerance,
+            timebase=emulation.bench if emulation is not None and file.simulated_cameras else None,
+            announce=twin.announce if twin is not None and file.simulated_cameras else None,
+            centre=file.board.centre,
+        )
+
+
+def free_line(file: RigFile) -> int:
+    """The highest TTL line that nothing else uses: it is high while the rig is on (at most four others are used)."""
+    used = {laser.gate_line for laser in file.lasers} | {file.board.floodlight_line}
+    return max(line for line in range(LINES) if line not in used)
