@@ -24,12 +24,13 @@ from hw.devices.elliptec import ElliptecTable
 from hw.devices.mm_ard import BAUD as BOARD_BAUD
 from hw.devices.mm_ard import LINES, MirrorBoard
 from hw.devices.omicron import Mode, OmicronLaser
+from hw.devices.ophir import BAUD as OPHIR_BAUD
+from hw.devices.ophir import OphirMeter
 from hw.devices.turning import Table
 from hw.devices.zaber import BAUD as ZABER_BAUD
 from hw.devices.zaber import ZaberTable
 from hw.errors import DeviceFault, InputError
 from hw.interface import Camera
-from hw.ports.protocol_memory import attach
 from hw.rig import Board, Devices, Head, LaserWiring, SerialRig
 from hw.serial_link import Link
 from pipeline.rig import RigConfig
@@ -206,8 +207,7 @@ class Connector:
     def __init__(self, file: RigFile, clock: Clock, emulation: Emulation | None, logs: Path | None) -> None:
         self.file, self.clock, self.emulation, self.logs = file, clock, emulation, logs
         self._follow = file.simulated_cameras
-        lines = {} if emulation is None else emulation.lines
-        self._urls = {name: attach(f"rig-{id(self)}-{name}", line) for name, line in lines.items()}
+        self._urls = {} if emulation is None else emulation.attach()
 
     def link(self, port: str, baud: int, device: str, name: str, guarded: bool = False) -> Link:
         """A device's link. `name` is that of its emulated line and of its byte log."""
@@ -217,12 +217,24 @@ class Connector:
             url = f"guard://{port}" if guarded else port
         return Link(url, baud, device, self.clock, None if self.logs is None else ByteLog(self.logs / f"{name}.log"))
 
-    def laser(self, index: int) -> Head:
+    def omicron(self, index: int) -> OmicronLaser:
         """A laser's driver; connecting switches it off."""
         device = self.file.lasers[index]
         name = f"laser {device.wavelength_nm:g} nm"
         link = self.link(device.port, device.baud, name, f"laser{index}", guarded=True)
-        head = _opened(link, lambda: OmicronLaser(link, device.wavelength_nm))
+        return _opened(link, lambda: OmicronLaser(link, device.wavelength_nm))
+
+    def meter(self) -> OphirMeter:
+        """The power meter's driver."""
+        device = self.file.power_meter
+        if device is None:
+            raise InputError("the rig file has no power meter", key="power_meter")
+        link = self.link(device.port, OPHIR_BAUD, "power meter", "power_meter")
+        return _opened(link, lambda: OphirMeter(link))
+
+    def laser(self, index: int) -> Head:
+        """A laser as the rig uses it."""
+        device, head = self.file.lasers[index], self.omicron(index)
         if device.port == EMULATED or not self._follow or self.emulation is None:
             return head
         return FollowedHead(head, self.emulation.bench, index)

@@ -1,0 +1,317 @@
+"""`disco-twin rig probe | selftest | emulate`: what is on the ports, does it work, and devices to try it all with."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_twin.assembly import Connector, free_line, open_camera, require_black
+from disco_twin.rig_file import EMULATED, GenicamDevice, RigFile
+from hw.clock import WallClock
+from hw.errors import DeviceFault, DiscoError, InputError
+from hw.interface import Aim
+from hw.rig import Board
+from pipeline.rig import RigConfig
+
+if TYPE_CHECKING:
+    from disco_twin.firmware.emulate import Emulation
+
+log = logging.getLogger(__name__)
+
+F32 = NDArray[np.float32]
+
+DARK_COUNTS = 8  # of the photodiode's 1023 with every gate shut
+TEST_ANGLE_DEG = 30.0
+ANGLE_TOLERANCE_DEG = 0.05
+FRAMES = 20
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of a probe or self-test."""
+
+    name: str
+    good: bool
+    text: str
+
+    def __str__(self) -> str:
+        return f"{'ok  ' if self.good else 'FAIL'}  {self.name:<22} {self.text}"
+
+
+def _try(name: str, check: Callable[[], str]) -> Finding:
+    try:
+        return Finding(name, True, check())
+    except DiscoError as error:
+        return Finding(name, False, str(error))
+
+
+def _connector(file: RigFile, logs: Path | None) -> Connector:
+    """For real devices: what is emulated is left out by the callers."""
+    if logs is not None:
+        logs.mkdir(parents=True, exist_ok=True)
+    return Connector(file, WallClock(), None, logs)
+
+
+def _shapes(file: RigFile, scene: RigConfig | None) -> list[tuple[GenicamDevice, tuple[int, int]]]:
+    """The GenICam cameras and their (height, width), which the scene knows."""
+    cameras = [camera for camera in file.cameras if isinstance(camera, GenicamDevice)]
+    if cameras and scene is None:
+        raise InputError("GenICam cameras need the scene, which knows their size", remedy="add --scene SCENE")
+    sizes = {} if scene is None else {camera.name: (camera.height, camera.width) for camera in scene.cameras}
+    return [(camera, sizes[camera.name]) for camera in cameras]
+
+
+def probe(file: RigFile, scene: RigConfig | None, logs: Path | None = None) -> Iterator[Finding]:
+    """Connect to every real device and let it say what it is. Lasers are switched off and gates shut by that."""
+    connect = _connector(file, logs)
+
+    def laser(index: int) -> str:
+        head = connect.omicron(index)
+        found = head.identity
+        head.close()
+        return f"{found.model} {found.wavelength_nm:g} nm, {found.max_power_mw:g} mW, no. {found.serial_number}; off"
+
+    def board() -> str:
+        driver = connect.board()
+        driver.close()
+        return "MM-Ard; every line low"
+
+    def table() -> str:
+        driver = connect.table()
+        angle = np.rad2deg(driver.angle_rad())
+        driver.close()
+        return f"{file.turntable.kind}, at {angle:.2f} deg"
+
+    for index, device in enumerate(file.lasers):
+        if device.port != EMULATED:
+            yield _try(f"laser {device.wavelength_nm:g} nm", lambda index=index: laser(index))  # type: ignore[misc]
+    if file.board.port != EMULATED:
+        yield _try("mirror board", board)
+    if file.turntable.port != EMULATED:
+        yield _try("turntable", table)
+    if file.power_meter is not None and file.power_meter.port != EMULATED:
+        yield _try("power meter", lambda: f"reads {1e3 * _metered(connect):.3f} mW")
+    for device_, shape in _shapes(file, scene):
+        yield _try(f"camera {device_.name}", lambda d=device_, s=shape: _camera_says(file, d, s))  # type: ignore[misc]
+
+
+def _metered(connect: Connector) -> float:
+    meter = connect.meter()
+    try:
+        return meter.read()
+    finally:
+        meter.close()
+
+
+def _camera_says(file: RigFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
+    assert file.sensor is not None
+    camera = open_camera(device, file.sensor, shape)
+    try:
+        return camera.grabber.identity()
+    finally:
+        camera.close()
+
+
+def selftest(file: RigFile, scene: RigConfig | None, armed: bool, logs: Path | None = None) -> Iterator[Finding]:
+    """Exercise every real device. Lasers emit, one behind an open gate at a time, only if `armed`."""
+    connect = _connector(file, logs)
+    if file.turntable.port != EMULATED:
+        yield _try("turntable", lambda: _test_table(connect))
+    for device, shape in _shapes(file, scene):
+        yield _try(f"camera {device.name}", lambda d=device, s=shape: _test_camera(file, d, s))  # type: ignore[misc]
+    if file.board.port == EMULATED:
+        return
+    try:
+        board = connect.board()
+    except DiscoError as error:
+        yield Finding("mirror board", False, str(error))
+        return
+    try:
+        yield _try("mirrors", lambda: _test_mirrors(file, board))
+        yield _try("gates", lambda: _test_lines(file, board))
+        yield _try("photodiode, dark", lambda: _test_dark(file, board))
+        for index, laser in enumerate(file.lasers):
+            name = f"laser {laser.wavelength_nm:g} nm"
+            if laser.port == EMULATED:
+                continue
+            if armed:
+                yield _try(name, lambda index=index: _test_laser(connect, board, index))  # type: ignore[misc]
+            else:
+                yield _try(name, lambda index=index: _test_off(connect, index))  # type: ignore[misc]
+    finally:
+        board.close()
+
+
+def _test_table(connect: Connector) -> str:
+    table = connect.table()
+    try:
+        table.home()
+        for angle in (TEST_ANGLE_DEG, 0.0):
+            table.move(float(np.deg2rad(angle)))
+            off = (np.rad2deg(table.angle_rad()) - angle + 180.0) % 360.0 - 180.0
+            if abs(off) > ANGLE_TOLERANCE_DEG:
+                problem = (
+                    f"says that it stands {off:+.3f} deg from {angle:g} deg (allowed: {ANGLE_TOLERANCE_DEG:g} off)"
+                )
+                raise DeviceFault(table.link.url, "turntable", problem, "check microsteps_per_deg in the rig file")
+        return f"homed, turned to {TEST_ANGLE_DEG:g} deg and back"
+    finally:
+        table.close()
+
+
+def _test_camera(file: RigFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
+    assert file.sensor is not None
+    camera = open_camera(device, file.sensor, shape)
+    try:
+        black = require_black(camera, file.sensor)
+        for _ in range(FRAMES):
+            camera.expose()
+        return f"{FRAMES} brackets, {camera.lost} frames taken again, black level {black:.1f} DN"
+    finally:
+        camera.close()
+
+
+def _test_mirrors(file: RigFile, board: Board) -> str:
+    for u in file.board.limits_u:
+        for v in file.board.limits_v:
+            board.set_mirrors(u, v)
+    board.set_mirrors(*file.board.centre)
+    return "took every corner of their limits (look whether they moved)"
+
+
+def _test_lines(file: RigFile, board: Board) -> str:
+    lines = [laser.gate_line for laser in file.lasers] + [file.board.floodlight_line, free_line(file)]
+    for line in lines:
+        board.set_lines(1 << line)
+        board.set_lines(0)
+    return f"lines {', '.join(map(str, lines))} high and low one by one, read back"
+
+
+def _test_dark(file: RigFile, board: Board) -> str:
+    counts = [board.counts(laser.photodiode_pin) for laser in file.lasers]
+    if max(counts) > DARK_COUNTS:
+        problem = f"reads {max(counts)} counts with every gate shut (allowed: {DARK_COUNTS})"
+        raise DeviceFault("board", "the photodiode", problem, "shade it, or correct its amplifier's offset")
+    return f"{', '.join(map(str, counts))} counts"
+
+
+def _test_off(connect: Connector, index: int) -> str:
+    head = connect.omicron(index)
+    try:
+        return f"{head.measured_mw():.2f} mW while off (not armed: --arm lets it emit)"
+    finally:
+        head.close()
+
+
+def _test_laser(connect: Connector, board: Board, index: int) -> str:
+    """Emission, gate and photodiode against the set point, then off, with the gate open, against darkness."""
+    file, wiring = connect.file, connect.file.lasers[index]
+    head = connect.omicron(index)
+    try:
+        head.arm(wiring.power_mw)
+        head.emit()
+        connect.clock.sleep(file.warm_up_s)
+        head.require_power(file.power_tolerance)
+        own = head.measured_mw()
+        board.set_lines(1 << wiring.gate_line)
+        seen = 1e3 * board.counts(wiring.photodiode_pin) * wiring.watts_per_count
+        low, high = (share * wiring.power_mw for share in wiring.photodiode_limits)
+        if not low <= seen <= high:
+            problem = f"gives {seen:.2f} mW at the photodiode through its open gate (allowed: {low:g} to {high:g})"
+            raise DeviceFault(f"pin {wiring.photodiode_pin}", head.name, problem, "gate_line, photodiode_pin, gain")
+        meter = "" if file.power_meter is None else f", power meter {1e3 * _metered(connect):.2f} mW"
+        head.stop_emission()
+        dark = board.counts(wiring.photodiode_pin)
+        if dark > DARK_COUNTS:
+            problem = f"is off, and its photodiode still reads {dark} counts"
+            raise DeviceFault(
+                f"pin {wiring.photodiode_pin}", head.name, problem, "check the wiring of gate and interlock"
+            )
+        return f"set {wiring.power_mw:g} mW, own reading {own:.2f} mW, photodiode {seen:.2f} mW{meter}; off again"
+    finally:
+        board.shut()
+        head.close()
+
+
+# ---- emulated devices for another program
+
+
+class Darkness:
+    """A response source for devices without a camera."""
+
+    def prepare(self, aims: Sequence[Aim]) -> None:
+        """Nothing to do."""
+
+    def image(self, camera: int, aim: Aim, laser: int) -> F32:
+        """Nobody looks."""
+        raise DiscoError("these emulated devices have no camera")
+
+    def silhouette(self, camera: int, angle: int) -> F32:
+        """Nobody looks."""
+        raise DiscoError("these emulated devices have no camera")
+
+
+def emulated_devices(scene: RigConfig, seed: int) -> Emulation:
+    """The devices of a scene in real time, for cameras elsewhere: the photodiode reads what falls on it now."""
+    from disco_twin.firmware.emulate import Emulation
+    from disco_twin.rig import TwinRig, watts_per_count
+
+    emulation = Emulation(TwinRig(scene, Darkness(), seed), WallClock())
+    bench = emulation.bench
+
+    def live(pin: int) -> int:
+        if bench.light() != [pin]:
+            return 0
+        watts = bench.heads[pin].emission(bench.clock.now()) * bench.heads[pin].max_power_mw * 1e-3
+        return round(watts / watts_per_count(scene.lasers[pin]))
+
+    bench.board.sample = live
+    return emulation
+
+
+@contextmanager
+def served(scene: RigConfig, seed: int, folder: Path) -> Iterator[Path]:
+    """Emulated devices on pseudo-terminals in a folder, and the rig file that reaches them."""
+    from disco_twin.firmware.serve import Server
+
+    folder.mkdir(parents=True, exist_ok=True)
+    with Server(emulated_devices(scene, seed).lines, folder) as server:
+        path = folder / "rig.toml"
+        path.write_text(rig_file_of(scene, {name: str(Path(url).absolute()) for name, url in server.urls.items()}))
+        yield path
+
+
+def rig_file_of(scene: RigConfig, ports: dict[str, str]) -> str:
+    """The rig file of a scene's emulated rig, as TOML; `ports` by name of the line, `emulated` where none is given."""
+    from disco_twin.firmware.bench import FLOOD_LINE
+    from disco_twin.firmware.zaber import MICROSTEPS_PER_DEG
+    from disco_twin.rig import watts_per_count
+
+    parts = ["format_version = 1", "warm_up_s = 0.0 # emulated lasers have nothing to warm up", ""]
+    for i, laser in enumerate(scene.lasers):
+        parts += [
+            "[[lasers]]",
+            'kind = "omicron"',
+            f'port = "{ports.get(f"laser{i}", EMULATED)}"',
+            f"wavelength_nm = {laser.wavelength_nm}",
+            f"power_mw = {laser.power_mw}",
+            f"gate_line = {i}",
+            f"photodiode_pin = {i}",
+            f"watts_per_count = {watts_per_count(laser)!r}",
+            "photodiode_limits = [0.1, 1.5] # the twin's lasers start cold",
+            "",
+        ]
+    parts += ["[board]", 'kind = "mm-ard"', f'port = "{ports.get("board", EMULATED)}"']
+    parts += [f"floodlight_line = {FLOOD_LINE}", ""]
+    parts += ["[turntable]", 'kind = "zaber"', f'port = "{ports.get("turntable", EMULATED)}"']
+    parts += [f"microsteps_per_deg = {MICROSTEPS_PER_DEG!r}", ""]
+    for camera in scene.cameras:
+        parts += ["[[cameras]]", 'kind = "simulated"', f'name = "{camera.name}"', ""]
+    return "\n".join(parts)
