@@ -5,7 +5,8 @@ The twin and real devices implement the same protocols. Units: radians, watts, s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol, Self
@@ -29,6 +30,16 @@ class Laser(Protocol):
         """Let light out. The rig refuses a second open gate."""
 
     def close_gate(self) -> None: ...
+
+
+@contextmanager
+def gate_open(laser: Laser) -> Iterator[None]:
+    """The laser's gate open; shut again whatever happens, even if opening failed half-way."""
+    try:
+        laser.open_gate()
+        yield
+    finally:
+        laser.close_gate()
 
 
 class Projector(Protocol):

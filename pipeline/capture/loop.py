@@ -16,10 +16,11 @@ from pathlib import Path
 from types import FrameType
 
 from hw.errors import DiscoError, InputError
-from hw.interface import Floodlight, Laser, Rig
-from hw.record import RawImage
+from hw.interface import Floodlight, Rig, gate_open
+from hw.record import RawImage, Sensor
 from pipeline.capture.layout import ImageMeta
 from pipeline.capture.plan import ImageAddress, Plan
+from pipeline.capture.reference import require_unmoved
 from pipeline.capture.stream import StreamReader, StreamWriter
 
 log = logging.getLogger(__name__)
@@ -44,11 +45,14 @@ class CaptureReport:
     bytes_stored: int
 
 
-def capture(rig: Rig, plan: Plan, folder: Path, progress: Progress | None = None) -> CaptureReport:
+def capture(
+    rig: Rig, plan: Plan, folder: Path, progress: Progress | None = None, sensor: Sensor | None = None
+) -> CaptureReport:
     """Take the images of the plan that are not yet stored in the folder. The rig is safe whenever this ends.
 
     Ctrl-C (or SIGTERM, SIGHUP) is obeyed at once, since lasers must go out: the image in progress is dropped, to be
     taken again, and `Interrupted` raised. The folder of another plan is refused before the rig is switched on.
+    With a `sensor`, a rig that has moved since the capture was interrupted is refused (`pipeline.capture.reference`).
     """
     _require_match(rig, plan)
     with StreamWriter(folder, plan) as stream:
@@ -58,6 +62,7 @@ def capture(rig: Rig, plan: Plan, folder: Path, progress: Progress | None = None
             with _Signals() as signals:
                 try:
                     with rig:
+                        _restore(rig, stream, sensor)
                         _sweep(rig, stream, signals, progress)
                 except KeyboardInterrupt:
                     raise _interrupted(stream) from None
@@ -80,7 +85,6 @@ def _require_match(rig: Rig, plan: Plan) -> None:
 def _sweep(rig: Rig, stream: StreamWriter, signals: _Signals, progress: Progress | None) -> None:
     plan = stream.plan
     announced = None
-    _restore(rig, stream)
     for index in range(len(stream), len(plan)):
         address = plan.address(index)
         if address.kind == "silhouette":
@@ -95,11 +99,14 @@ def _sweep(rig: Rig, stream: StreamWriter, signals: _Signals, progress: Progress
             progress(index + 1, len(plan))
 
 
-def _restore(rig: Rig, stream: StreamWriter) -> None:
+def _restore(rig: Rig, stream: StreamWriter, sensor: Sensor | None) -> None:
     """Bring rig and clock to where they were when the last stored image was complete."""
     meta = stream.last_meta()
     if meta is None:
         return
+    if sensor is not None:
+        with StreamReader(stream.folder) as stored:
+            require_unmoved(rig, stored, sensor)
     rig.turntable.move(meta.angle_rad)
     # After a silhouette the mirrors still stand where the last spot of the view before it left them.
     backwards = (stream.plan.address(i).spot for i in range(len(stream) - 1, -1, -1))
@@ -120,20 +127,10 @@ def _take(rig: Rig, plan: Plan, address: ImageAddress) -> tuple[RawImage, ImageM
     aim = plan.spots[address.spot]
     if address.laser == 0:
         rig.projector.move(aim.u, aim.v)
-    with _open(rig.lasers[address.laser]):
+    with gate_open(rig.lasers[address.laser]):
         raw = camera.expose()
         power = rig.photodiode.read()
     return raw, ImageMeta(rig.now(), power, angle, aim.u, aim.v)
-
-
-@contextmanager
-def _open(laser: Laser) -> Iterator[None]:
-    """The laser's gate open; shut again whatever happens, even if opening failed half-way."""
-    try:
-        laser.open_gate()
-        yield
-    finally:
-        laser.close_gate()
 
 
 @contextmanager

@@ -65,7 +65,7 @@ class StreamWriter:
     """
 
     def __init__(self, folder: Path, plan: Plan) -> None:
-        self.plan = plan
+        self.plan, self.folder = plan, folder
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._files = StreamFiles(folder, os.O_RDWR | os.O_CREAT)

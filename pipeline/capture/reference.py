@@ -1,0 +1,148 @@
+"""Has the rig moved while the capture was interrupted? A stored spot is shot again and compared.
+
+Compared are laser power (photodiode), radiance per watt and where the light lies in the image. Anything beyond the
+tolerances is refused with its figures: images before and after would not belong to one object in one place.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from hw.errors import DiscoError
+from hw.interface import Rig, gate_open
+from hw.record import Sensor, to_radiance
+from pipeline.capture.plan import ImageAddress
+from pipeline.capture.stream import CorruptImage, StreamReader
+
+log = logging.getLogger(__name__)
+
+F64 = NDArray[np.float64]
+
+LOOK_BACK = 30  # stored images, among which the brightest is the reference
+BRIGHT_SIGMA = 50.0  # light of all pixels together, in its standard deviations: below, nothing can be verified
+SHIFT_PX = 0.5
+POWER_SHARE = 0.2
+RADIANCE_SHARE = 0.1
+PATTERN_SHARE = 0.15  # rms of the difference that neither shift nor brightness explain, of the rms of the image
+
+
+class RigMoved(DiscoError):
+    """The rig is not what it was when the last images were taken."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Now against then. power, radiance: ratios (radiance per watt); shift_px: (right, down); pattern: share of rms."""
+
+    power: float
+    radiance: float
+    shift_px: tuple[float, float]
+    pattern: float
+
+    @property
+    def moved(self) -> bool:
+        """Whether any figure is beyond its tolerance."""
+        return (
+            not abs(self.power - 1) <= POWER_SHARE
+            or not abs(self.radiance - 1) <= RADIANCE_SHARE
+            or not np.hypot(*self.shift_px) <= SHIFT_PX
+            or not self.pattern <= PATTERN_SHARE
+        )
+
+    def __str__(self) -> str:
+        right, down = self.shift_px
+        return (
+            f"laser power {100 * (self.power - 1):+.1f} % (allowed: {100 * POWER_SHARE:g}), "
+            f"radiance per watt {100 * (self.radiance - 1):+.1f} % ({100 * RADIANCE_SHARE:g}), "
+            f"moved by {right:+.2f}, {down:+.2f} px ({SHIFT_PX:g}), "
+            f"pattern differs by {100 * self.pattern:.1f} % ({100 * PATTERN_SHARE:g})"
+        )
+
+
+def require_unmoved(rig: Rig, stored: StreamReader, sensor: Sensor) -> Comparison | None:
+    """Shoot a stored spot again, and refuse to go on if it differs. None: nothing stored is bright enough to tell.
+
+    Leaves turntable, mirrors and clock at the reference, gates shut.
+    """
+    reference = _brightest(stored, sensor)
+    if reference is None:
+        log.warning("none of the last stored images is bright enough to tell whether the rig has moved")
+        return None
+    address, then, variance = reference
+    plan, meta = stored.plan, stored.meta(address)
+    aim = plan.spots[address.spot]
+    rig.turntable.move(meta.angle_rad)
+    rig.projector.move(aim.u, aim.v)
+    rig.resume_at(meta.time_s)  # a simulated laser's drift is a function of time: like is compared with like
+    with gate_open(rig.lasers[address.laser]):
+        raw = rig.cameras[plan.camera_of(address.view)].expose()
+        power = rig.photodiode.read()
+    if not power > 0:
+        raise RigMoved(f"no laser light: the photodiode reads {power:g} W where it read {meta.photodiode_w:g} W")
+    again = to_radiance(raw, sensor, address.laser)
+    now, noise = again.radiance / power, again.variance / power**2
+    result = compare(then, np.asarray(now, float), variance + noise, power / meta.photodiode_w)
+    log.info("reference (%s): %s", address, result)
+    if result.moved:
+        raise RigMoved(
+            f"the rig has changed since image {plan.index(address)} ({address}): {result}. Remedy: put it back, or "
+            "start a new capture in another folder"
+        )
+    return result
+
+
+def _brightest(stored: StreamReader, sensor: Sensor) -> tuple[ImageAddress, F64, F64] | None:
+    """The reference: its address, radiance per watt and variance, (H, W) each."""
+    best, found = BRIGHT_SIGMA, None
+    for index in range(len(stored) - 1, max(-1, len(stored) - 1 - LOOK_BACK), -1):
+        address = stored.plan.address(index)
+        if address.kind != "spot" or not stored.meta(index).photodiode_w > 0:
+            continue
+        try:
+            image = to_radiance(stored.read(index), sensor, address.laser)
+        except CorruptImage as error:
+            log.warning("%s", error)
+            continue
+        watts = stored.meta(index).photodiode_w
+        radiance, variance = image.radiance.astype(float) / watts, image.variance.astype(float) / watts**2
+        significance = radiance.sum() / np.sqrt(variance.sum())
+        if significance > best:
+            best, found = significance, (address, radiance, variance)
+    return found
+
+
+def compare(then: F64, now: F64, variance: F64, power: float) -> Comparison:
+    """(H, W) radiances per watt, variance of their difference, ratio of the powers.
+
+    Shift and brightness together by Gauss-Newton on now(x) = g then(x - d) (Lucas and Kanade 1981), both images a
+    little smoothed, from the whole pixels at which their correlation is highest.
+    """
+    smooth = [np.asarray(ndimage.gaussian_filter(image, 1.0)) for image in (then, now)]
+    shift = _whole_pixels(*smooth)
+    gain = 1.0
+    for _ in range(8):
+        moved = ndimage.shift(smooth[0], shift, order=3, mode="nearest")
+        columns = [-gain * np.asarray(g) for g in np.gradient(moved)] + [moved]
+        matrix = np.stack([c.ravel() for c in columns], axis=1)
+        step, *_ = np.linalg.lstsq(matrix, (smooth[1] - gain * moved).ravel(), rcond=None)
+        shift, gain = shift + step[:2], gain + float(step[2])
+        if np.abs(step[:2]).max() < 1e-3:
+            break
+    rest = now - gain * ndimage.shift(then, shift, order=3, mode="nearest")
+    unexplained = max(0.0, float((rest**2).mean() - variance.mean()))
+    pattern = float(np.sqrt(unexplained / max(float((now**2).mean()), 1e-300)))
+    return Comparison(power, gain, (float(shift[1]), float(shift[0])), pattern)
+
+
+def _whole_pixels(then: F64, now: F64) -> F64:
+    """(2,) rows and columns by which `now` is moved, to a pixel: the highest circular correlation."""
+    spectrum = np.fft.rfft2(now - now.mean()) * np.conj(np.fft.rfft2(then - then.mean()))
+    correlation = np.fft.irfft2(spectrum, s=then.shape)
+    peak = np.array(np.unravel_index(int(np.argmax(correlation)), then.shape), float)
+    size = np.array(then.shape, float)
+    return np.where(peak > size / 2, peak - size, peak)
