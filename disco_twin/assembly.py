@@ -16,7 +16,7 @@ import numpy as np
 
 from disco_twin.firmware.bench import Bench
 from disco_twin.firmware.turning import Spindle
-from disco_twin.rig_file import EMULATED, GenicamDevice, LaserDevice, RigFile, SensorDevice, ZaberDevice
+from disco_twin.rig_file import EMULATED, DevicesFile, GenicamDevice, LaserDevice, SensorDevice, ZaberDevice
 from hw.bytelog import ByteLog
 from hw.clock import Clock, VirtualClock, WallClock
 from hw.devices.elliptec import BAUD as ELLIPTEC_BAUD
@@ -204,7 +204,7 @@ def _turn_twin(bench: Bench) -> Callable[[float], None]:
 class Connector:
     """Opens what a rig file names. `emulation` has the devices that are emulated, and the twin that real ones move."""
 
-    def __init__(self, file: RigFile, clock: Clock, emulation: Emulation | None, logs: Path | None) -> None:
+    def __init__(self, file: DevicesFile, clock: Clock, emulation: Emulation | None, logs: Path | None) -> None:
         self.file, self.clock, self.emulation, self.logs = file, clock, emulation, logs
         self._follow = file.simulated_cameras
         self._urls = {} if emulation is None else emulation.attach()
@@ -332,7 +332,7 @@ def require_black(camera: GenicamCamera, sensor: SensorDevice) -> float:
 
 @contextmanager
 def assembled(
-    file: RigFile, scene: RigConfig, twin: TwinRig | None = None, logs: Path | None = None
+    file: DevicesFile, scene: RigConfig, twin: TwinRig | None = None, logs: Path | None = None
 ) -> Iterator[SerialRig]:
     """The rig, its cameras open. `twin`: where something is emulated or simulated; its cameras are used or not."""
     from disco_twin.firmware.emulate import Emulation
@@ -369,7 +369,7 @@ def assembled(
         )
 
 
-def free_line(file: RigFile) -> int:
+def free_line(file: DevicesFile) -> int:
     """The highest TTL line that nothing else uses: it is high while the rig is on (at most four others are used)."""
     used = {laser.gate_line for laser in file.lasers} | {file.board.floodlight_line}
     return max(line for line in range(LINES) if line not in used)

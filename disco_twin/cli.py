@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.console import Console
 
+from disco_twin.cli_rig import ArmOption, LogsOption, rig_app
 from hw.errors import DiscoError, naming, refused_by_the_disk
 from pipeline.capture.loop import Interrupted
 
@@ -28,6 +29,7 @@ ProfileOption = Annotated[
 MethodsOption = Annotated[
     str | None, typer.Option(help="`all`, or a list such as default,disco2004; left out: the scene's.")
 ]
+app.add_typer(rig_app, name="rig")
 
 
 @app.command()
@@ -44,15 +46,28 @@ def run(scene: SceneFile, out: RunOut, profile: ProfileOption = "full", methods:
 
 
 @app.command()
-def capture(scene: SceneFile, out: RunOut, profile: ProfileOption = "full") -> None:
+def capture(
+    scene: SceneFile,
+    out: RunOut,
+    profile: ProfileOption = "full",
+    rig: Annotated[
+        Path | None, typer.Option(metavar="RIG.TOML", help="Capture with the devices of a rig file, not with the twin.")
+    ] = None,
+    arm: ArmOption = False,
+    logs: LogsOption = None,
+) -> None:
     """Scan and capture only: DIR/capture is what the pipeline reads."""
     from disco_twin.console import run_log
+    from disco_twin.rig_capture import capture_with_devices, open_rig_file
     from disco_twin.run import capture_stages, open_run
 
     with naming(scene):
         opened = open_run(scene, out, profile, None, console)
         with run_log(opened.folder.root / "run.log", console):
-            capture_stages(opened)
+            if rig is None:
+                capture_stages(opened)
+            else:
+                capture_with_devices(opened, open_rig_file(opened, rig, arm), rig, logs)
 
 
 @app.command()

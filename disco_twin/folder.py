@@ -64,6 +64,16 @@ class RunFolder:
         return self.root / "capture"
 
     @property
+    def devices_record(self) -> Path:
+        """The rig file of a capture by devices."""
+        return self.capture / "devices.toml"
+
+    @property
+    def taken_by_devices(self) -> bool:
+        """Whether devices took this folder's images: nothing simulates them again or removes them."""
+        return self.devices_record.is_file()
+
+    @property
     def twin(self) -> Path:
         return self.root / "twin"
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_twin.assembly import Connector, free_line, open_camera, require_black
-from disco_twin.rig_file import EMULATED, GenicamDevice, RigFile
+from disco_twin.rig_file import EMULATED, DevicesFile, GenicamDevice
 from hw.clock import WallClock
 from hw.errors import DeviceFault, DiscoError, InputError
 from hw.interface import Aim
@@ -52,14 +52,14 @@ def _try(name: str, check: Callable[[], str]) -> Finding:
         return Finding(name, False, str(error))
 
 
-def _connector(file: RigFile, logs: Path | None) -> Connector:
+def _connector(file: DevicesFile, logs: Path | None) -> Connector:
     """For real devices: what is emulated is left out by the callers."""
     if logs is not None:
         logs.mkdir(parents=True, exist_ok=True)
     return Connector(file, WallClock(), None, logs)
 
 
-def _shapes(file: RigFile, scene: RigConfig | None) -> list[tuple[GenicamDevice, tuple[int, int]]]:
+def _shapes(file: DevicesFile, scene: RigConfig | None) -> list[tuple[GenicamDevice, tuple[int, int]]]:
     """The GenICam cameras and their (height, width), which the scene knows."""
     cameras = [camera for camera in file.cameras if isinstance(camera, GenicamDevice)]
     if cameras and scene is None:
@@ -68,7 +68,7 @@ def _shapes(file: RigFile, scene: RigConfig | None) -> list[tuple[GenicamDevice,
     return [(camera, sizes[camera.name]) for camera in cameras]
 
 
-def probe(file: RigFile, scene: RigConfig | None, logs: Path | None = None) -> Iterator[Finding]:
+def probe(file: DevicesFile, scene: RigConfig | None, logs: Path | None = None) -> Iterator[Finding]:
     """Connect to every real device and let it say what it is. Lasers are switched off and gates shut by that."""
     connect = _connector(file, logs)
 
@@ -110,7 +110,7 @@ def _metered(connect: Connector) -> float:
         meter.close()
 
 
-def _camera_says(file: RigFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
+def _camera_says(file: DevicesFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
     assert file.sensor is not None
     camera = open_camera(device, file.sensor, shape)
     try:
@@ -119,7 +119,7 @@ def _camera_says(file: RigFile, device: GenicamDevice, shape: tuple[int, int]) -
         camera.close()
 
 
-def selftest(file: RigFile, scene: RigConfig | None, armed: bool, logs: Path | None = None) -> Iterator[Finding]:
+def selftest(file: DevicesFile, scene: RigConfig | None, armed: bool, logs: Path | None = None) -> Iterator[Finding]:
     """Exercise every real device. Lasers emit, one behind an open gate at a time, only if `armed`."""
     connect = _connector(file, logs)
     if file.turntable.port != EMULATED:
@@ -166,7 +166,7 @@ def _test_table(connect: Connector) -> str:
         table.close()
 
 
-def _test_camera(file: RigFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
+def _test_camera(file: DevicesFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
     assert file.sensor is not None
     camera = open_camera(device, file.sensor, shape)
     try:
@@ -178,7 +178,7 @@ def _test_camera(file: RigFile, device: GenicamDevice, shape: tuple[int, int]) -
         camera.close()
 
 
-def _test_mirrors(file: RigFile, board: Board) -> str:
+def _test_mirrors(file: DevicesFile, board: Board) -> str:
     for u in file.board.limits_u:
         for v in file.board.limits_v:
             board.set_mirrors(u, v)
@@ -186,7 +186,7 @@ def _test_mirrors(file: RigFile, board: Board) -> str:
     return "took every corner of their limits (look whether they moved)"
 
 
-def _test_lines(file: RigFile, board: Board) -> str:
+def _test_lines(file: DevicesFile, board: Board) -> str:
     lines = [laser.gate_line for laser in file.lasers] + [file.board.floodlight_line, free_line(file)]
     for line in lines:
         board.set_lines(1 << line)
@@ -194,7 +194,7 @@ def _test_lines(file: RigFile, board: Board) -> str:
     return f"lines {', '.join(map(str, lines))} high and low one by one, read back"
 
 
-def _test_dark(file: RigFile, board: Board) -> str:
+def _test_dark(file: DevicesFile, board: Board) -> str:
     counts = [board.counts(laser.photodiode_pin) for laser in file.lasers]
     if max(counts) > DARK_COUNTS:
         problem = f"reads {max(counts)} counts with every gate shut (allowed: {DARK_COUNTS})"

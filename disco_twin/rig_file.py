@@ -151,7 +151,7 @@ class MeterDevice(Strict):
     port: Port
 
 
-class RigFile(Strict):
+class DevicesFile(Strict):
     """Every device of a rig."""
 
     format_version: Literal[1]
@@ -205,12 +205,12 @@ class RigFile(Strict):
         return any(camera.kind == "simulated" for camera in self.cameras)
 
 
-def load_rig_file(path: Path) -> RigFile:
+def load_rig_file(path: Path) -> DevicesFile:
     """Read and check a rig file."""
-    return load_toml(path, RigFile)
+    return load_toml(path, DevicesFile)
 
 
-def require_scene(rig: RigFile, scene: RigConfig, path: Path) -> None:
+def require_scene(rig: DevicesFile, scene: RigConfig, path: Path) -> None:
     """Refuse a rig file that is not this scene's rig."""
 
     def wrong(problem: str, key: str, value: object, allowed: object) -> InputError:

@@ -18,6 +18,7 @@ from disco_twin.world import World, identity, left_out_by_the_twin
 from hw.errors import InputError, refused_by_the_disk
 from pipeline.capture.files import IMAGES, JOURNAL, PLAN
 from pipeline.capture.loop import Interrupted
+from pipeline.capture.stream import StreamReader
 from pipeline.config import read_json
 from pipeline.reconstruct.settings import Method
 from pipeline.records import StageFigures
@@ -113,7 +114,7 @@ def drop_old_light(folder: RunFolder, key: str) -> None:
     marker = folder.twin / "light.key"
     if marker.is_file() and marker.read_text() == key:
         return
-    old = [folder.capture / name for name in (IMAGES, JOURNAL, PLAN)]
+    old = [] if folder.taken_by_devices else [folder.capture / name for name in (IMAGES, JOURNAL, PLAN)]
     old += [*folder.twin.glob("responses/spots-*.npy"), *folder.twin.glob("references/*.exr")]
     old = [path for path in old if path.is_file()]
     if old:
@@ -124,9 +125,13 @@ def drop_old_light(folder: RunFolder, key: str) -> None:
 
 
 def capture_stages(run: Run) -> None:
-    """Scan and capture."""
+    """Scan and capture by the twin. What devices have captured is left as it is, once it is complete."""
     from disco_twin import simulate
 
+    if run.folder.taken_by_devices:
+        with StreamReader(run.folder.capture) as stream:
+            stream.require_complete()
+        return
     key = light_key(run)
     drop_old_light(run.folder, key)
     scan_key = content_key(key, run.scene.relight.model_dump_json(include={"views"}))

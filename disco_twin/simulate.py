@@ -21,6 +21,8 @@ from pipeline.rig import CameraConfig, FaultsConfig
 
 if TYPE_CHECKING:
     from disco_twin.light.truth import Truth
+    from disco_twin.rig import TwinRig
+    from hw.record import Sensor
     from pipeline.capture.loop import CaptureReport
 
 log = logging.getLogger(__name__)
@@ -29,16 +31,21 @@ Progress = Callable[[int, int], None]  # done, total
 COLUMNS_AT_ONCE = 4  # columns of truth between two words on the progress
 
 
-def write_scan(world: World, capture: Path) -> None:
-    """The nominal rig, its sensor, the scanned mesh: what the pipeline is told beside the images and their plan."""
+def sensor_of(world: World, real: Sensor | None = None) -> Sensor:
+    """What the pipeline is told of the sensor: a real camera's, or the twin's."""
     from disco_twin.camera.lars3 import lars3_sensor
 
+    return lars3_sensor(world.scene.rig) if real is None else real
+
+
+def write_scan(world: World, capture: Path, sensor: Sensor | None = None) -> None:
+    """The nominal rig, its sensor, the scanned mesh: what the pipeline is told beside the images and their plan."""
     require_capturable(world)
     write_atomically(capture / "scan.ply", bytes(world.scan.export(file_type="ply")))
     told = world.scene.rig.model_copy(update={"faults": FaultsConfig()})  # which faults are on is the twin's secret
-    sensor = SensorFile(sensor=lars3_sensor(world.scene.rig))
+    known = SensorFile(sensor=sensor_of(world, sensor))
     write_atomically(capture / "rig.json", RigFile(rig=told).model_dump_json(indent=1).encode())
-    write_atomically(capture / "sensor.json", sensor.model_dump_json(indent=1).encode())
+    write_atomically(capture / "sensor.json", known.model_dump_json(indent=1).encode())
 
 
 def require_capturable(world: World) -> None:
@@ -56,19 +63,25 @@ def _require_equal_sizes(cameras: Sequence[CameraConfig], key: str) -> None:
         raise InputError("the twin's cameras must have one image size", key=key, value=sorted(sizes), remedy=remedy)
 
 
-def take_images(world: World, folder: RunFolder, progress: Progress) -> CaptureReport:
-    """The capture by the twin of the rig; continues where it was interrupted."""
+def twin_rig(world: World, folder: RunFolder) -> TwinRig:
+    """The twin of the rig in front of the object. Needs the renderer."""
     transport = world.transport
     from disco_twin.deviation import actual_rig
     from disco_twin.light.response import SpotResponses
     from disco_twin.rig import TwinRig
-    from pipeline.capture.loop import capture
 
     scene = world.scene
     actual = actual_rig(scene.rig, scene.seed)
     walks, scratch = scene.simulation.walks_per_spot, folder.twin / "responses"
     responses = SpotResponses(transport, scene.rig, actual, walks, world.seed("spots"), scratch)
-    return capture(TwinRig(scene.rig, responses, scene.seed, actual), world.plan, folder.capture, progress)
+    return TwinRig(scene.rig, responses, scene.seed, actual)
+
+
+def take_images(world: World, folder: RunFolder, progress: Progress) -> CaptureReport:
+    """The capture by the twin of the rig; continues where it was interrupted."""
+    from pipeline.capture.loop import capture
+
+    return capture(twin_rig(world, folder), world.plan, folder.capture, progress)
 
 
 def compute_truth(world: World, path: Path, progress: Progress) -> None:

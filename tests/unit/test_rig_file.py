@@ -15,7 +15,7 @@ from disco_twin.firmware.emulate import Emulation
 from disco_twin.firmware.serve import Server
 from disco_twin.rig import TwinRig
 from disco_twin.rig_commands import emulated_devices, rig_file_of
-from disco_twin.rig_file import RigFile, load_rig_file, require_scene
+from disco_twin.rig_file import DevicesFile, load_rig_file, require_scene
 from hw.errors import DeviceFault, InputError
 from pipeline.capture.loop import capture
 from pipeline.capture.stream import StreamReader
@@ -29,7 +29,7 @@ def text(**ports: str) -> str:
     return rig_file_of(RIG, ports)
 
 
-def rig_file(tmp_path: Path, content: str) -> RigFile:
+def rig_file(tmp_path: Path, content: str) -> DevicesFile:
     path = tmp_path / "rig.toml"
     path.write_text(content)
     return load_rig_file(path)

@@ -1,0 +1,81 @@
+"""`disco-twin rig`: find, test and emulate the devices of a rig file. Needs no renderer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+if TYPE_CHECKING:
+    from disco_twin.rig_commands import Finding
+    from pipeline.rig import RigConfig
+
+rig_app = typer.Typer(help="Devices: find them, test them, emulate them.", no_args_is_help=True)
+console = Console()
+
+RigPath = Annotated[Path, typer.Argument(metavar="RIG.TOML", help="The rig file.")]
+SceneOption = Annotated[
+    Path | None, typer.Option("--scene", metavar="SCENE", help="The scene, which knows the cameras' sizes.")
+]
+ArmOption = Annotated[bool, typer.Option("--arm", help="Let real lasers emit.")]
+LogsOption = Annotated[
+    Path | None, typer.Option("--logs", metavar="DIR", help="Keep every byte to and from the devices there.")
+]
+
+
+@rig_app.command()
+def probe(rig: RigPath, scene: SceneOption = None, logs: LogsOption = None) -> None:
+    """Connect to every real device and show what it is. Switches lasers off and shuts gates; nothing moves."""
+    from disco_twin.rig_commands import probe as run_probe
+    from disco_twin.rig_file import load_rig_file
+
+    _show(run_probe(load_rig_file(rig), _rig_of(scene), logs))
+
+
+@rig_app.command()
+def selftest(rig: RigPath, scene: SceneOption = None, arm: ArmOption = False, logs: LogsOption = None) -> None:
+    """Move, expose and read back every real device. Lasers emit only with --arm."""
+    from disco_twin.rig_commands import selftest as run_selftest
+    from disco_twin.rig_file import load_rig_file
+
+    _show(run_selftest(load_rig_file(rig), _rig_of(scene), arm, logs))
+
+
+@rig_app.command()
+def emulate(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="The scene whose devices are emulated.")],
+    folder: Annotated[Path, typer.Option("--ports", metavar="DIR", help="Where the ports and rig.toml appear.")],
+    seconds: Annotated[float, typer.Option(help="How long.", min=0.1)] = 3600.0,
+) -> None:
+    """Serve the devices of a scene on pseudo-terminals, in real time, and write the rig file that reaches them."""
+    from disco_twin.rig_commands import served
+    from disco_twin.scene import load_scene
+
+    loaded = load_scene(scene)
+    with served(loaded.rig, loaded.seed, folder) as path:
+        console.print(f"devices are served; rig file: {path}   (Ctrl-C ends it)", highlight=False, soft_wrap=True)
+        try:
+            time.sleep(seconds)
+        except KeyboardInterrupt:
+            console.print("ended")
+
+
+def _rig_of(scene: Path | None) -> RigConfig | None:
+    from disco_twin.scene import load_scene
+
+    return None if scene is None else load_scene(scene).rig
+
+
+def _show(findings: Iterable[Finding]) -> None:
+    good, count = True, 0
+    for finding in findings:
+        console.print(str(finding), highlight=False, markup=False, soft_wrap=True)
+        good, count = good and finding.good, count + 1
+    if not count:
+        console.print("every device of this rig file is emulated or simulated: there is nothing to connect to")
+    if not good:
+        raise typer.Exit(1)
