@@ -7,6 +7,7 @@ even while the main thread is held up in a library or by the disk.
 from __future__ import annotations
 
 import array
+import atexit
 import contextlib
 import fcntl
 import logging
@@ -50,6 +51,7 @@ class _Signals:
             self._pair = socket.socketpair()
             for end in self._pair:
                 end.setblocking(False)
+                atexit.register(end.close)
         reader, writer = self._pair
         if threading.current_thread() is threading.main_thread():
             signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
