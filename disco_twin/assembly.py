@@ -74,6 +74,10 @@ class LimitedBoard:
         """The TTL lines as they are."""
         return self.board.lines()
 
+    def shut_now(self) -> None:
+        """Every line low, without waiting for the answer."""
+        self.board.shut_now()
+
     def shut(self) -> None:
         """Every line low."""
         self.board.shut()
@@ -154,6 +158,11 @@ class FollowedHead:
         """The real laser's own reading."""
         self.head.require_power(tolerance)
 
+    def off_now(self) -> None:
+        """No light, without waiting for the answer."""
+        self.bench.heads[self.index].on_since = None
+        self.head.off_now()
+
     def force_off(self) -> None:
         """No light."""
         self.bench.heads[self.index].on_since = None
@@ -181,6 +190,11 @@ class FollowedBoard(LimitedBoard):
         """The TTL lines."""
         super().set_lines(pattern)
         self.bench.board.set_pattern(pattern)
+
+    def shut_now(self) -> None:
+        """Every line low, without waiting for the answer."""
+        self.bench.board.set_pattern(0)
+        super().shut_now()
 
     def shut(self) -> None:
         """Every line low."""

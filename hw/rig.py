@@ -21,6 +21,7 @@ from hw.interface import Aim, Camera, Floodlight, Laser, Photodiode, Projector, 
 
 log = logging.getLogger(__name__)
 
+HEARD_S = 0.02  # until what was told without waiting for an answer has been understood
 SETTLE_S = 0.005  # of the galvos, after the DAC has taken both values
 
 
@@ -32,6 +33,7 @@ class Head(Protocol):
     def arm(self, power_mw: float) -> None: ...
     def emit(self) -> None: ...
     def require_power(self, tolerance: float) -> None: ...
+    def off_now(self) -> None: ...
     def force_off(self) -> None: ...
     def close(self) -> None: ...
 
@@ -42,6 +44,7 @@ class Board(Protocol):
     def set_mirrors(self, u: int, v: int) -> None: ...
     def set_lines(self, pattern: int) -> None: ...
     def lines(self) -> int: ...
+    def shut_now(self) -> None: ...
     def shut(self) -> None: ...
     def counts(self, pin: int) -> int: ...
     def close(self) -> None: ...
@@ -170,13 +173,18 @@ class SerialRig:
         self.make_safe()
 
     def make_safe(self) -> None:
-        """Gates shut, lasers and floodlight off, ports given back. Never raises; the first device to fail stops no
-        other."""
+        """Gates shut, lasers and floodlight off, ports given back. Never raises; no device's failure stops another's.
+
+        First everybody is told, which takes no time; then each confirms, which a device that has fallen silent can draw
+        out for seconds.
+        """
         devices, self._devices = self._devices, None
         self._pattern, self._last_open = 0, -1
         if devices is None:
             return
-        steps: list[Callable[[], None]] = [devices.board.shut]
+        steps: list[Callable[[], None]] = [devices.board.shut_now]
+        steps += [head.off_now for head in devices.heads]
+        steps += [lambda: self.clock.sleep(HEARD_S), devices.board.shut]
         steps += [head.force_off for head in devices.heads]
         steps += [head.close for head in devices.heads]
         steps += [devices.board.close, devices.table.close]
@@ -318,7 +326,7 @@ class AdcPhotodiode:
             return 0.0
         self.rig.require_lines()
         wiring = self.rig.wiring[laser]
-        counts = sorted(board.counts(wiring.pin) for _ in range(3))[1]  # its protocol has no checksum
+        counts = board.counts(wiring.pin)
         watts = counts * wiring.watts_per_count
         low, high = wiring.limits
         if self.rig.open_gate == laser and (counts >= ADC_TOP or not low <= watts / (wiring.power_mw * 1e-3) <= high):
