@@ -43,6 +43,7 @@ class MirrorBoard:
         """Wait for the board to start, identify it, shut everything."""
         self.link = link
         self._inbox: Inbox[int] = Inbox(link, ByteFramer())
+        self._owed = False  # an answer that was not waited for may still come
         link.clock.sleep(BOOT_S)
         self.version = self._identify()
         self.shut()
@@ -54,12 +55,16 @@ class MirrorBoard:
         """Send, expect the echo and `answer` more bytes; tried again, since every command may be given twice."""
 
         def attempt() -> bytes:
+            if self._owed:
+                self._resynchronise()
             self._inbox.clear()
+            self._owed = True
             self.link.write(command)
             got = self._receive(len(echo) + answer, command)
             if got[: len(echo)] != echo:
                 problem = f"answered {command.hex(' ')} with {got.hex(' ')} instead of {echo.hex(' ')}"
                 raise Garbled(self.link.url, self.link.device, problem, "check cable and grounding of the board")
+            self._owed = False
             return got[len(echo) :]
 
         return persist(attempt, self._resynchronise)
@@ -78,6 +83,7 @@ class MirrorBoard:
     def _resynchronise(self) -> None:
         """Whatever it was waiting for or about to say: after this the board listens for a command, and is silent."""
         self._inbox.drain(FORGET_S)
+        self._owed = False
 
     # ---- identity
 
@@ -135,6 +141,8 @@ class MirrorBoard:
         """
         if not 0 <= pattern < 1 << LINES:
             raise InputError("no such pattern of TTL lines", value=pattern, allowed=f"0 to {(1 << LINES) - 1}")
+        if self._owed and not pattern:
+            self.shut_now()  # getting back into step takes a second
         for _ in range(ATTEMPTS):
             self._exchange(bytes([*RESTART, SET_LINES, pattern]), bytes([SET_LINES]))
             found = self.lines()
@@ -152,6 +160,7 @@ class MirrorBoard:
 
     def shut_now(self) -> None:
         """Say so without waiting for anything, first of all when something is wrong."""
+        self._owed = True
         self.link.write(bytes([*RESTART, SET_LINES, 0]))
 
     def lines(self) -> int:

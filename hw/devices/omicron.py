@@ -97,8 +97,6 @@ class OmicronFramer:
         """The answers that end in these bytes."""
         answers = []
         for byte in data:
-            if byte == 0:
-                continue
             if self._notice is not None:
                 if byte == 0x0D:
                     self.notices.append(self._notice.decode("latin-1"))
@@ -305,6 +303,9 @@ class OmicronLaser:
         if not 0.0 < power_mw <= top * (1.0 + 1e-9):
             problem = f"cannot be set to {power_mw:g} mW"
             raise DeviceRefused(self.link.url, self.name, problem, f"ask for more than 0 and at most {top:g} mW")
+        if self.faults() == [FAULTS[0]]:  # an interlock was open and is closed again; whoever arms it asks anew
+            log.warning("%s: %s; resetting it", self.name, FAULTS[0])
+            self.reset()
         self.require_ready()
         self._set("POn")
         self._set_power(min(1.0, power_mw / top))

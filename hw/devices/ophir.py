@@ -30,15 +30,19 @@ class OphirMeter:
 
     def __init__(self, link: Link) -> None:
         self.link = link
+        self._owed = False  # an answer that was not waited for may still come
         self._inbox: Inbox[str] = Inbox(link, LineFramer())
         self.model = self._identify()
         self.head = self._ask("HI", str)
 
     def _once(self, command: str) -> str:
+        if self._owed:
+            self._resynchronise()
         self._inbox.clear()
         self.link.write(f"${command}\r\n".encode("ascii"))
         identity = command in ("II", "HI")
         line = self._inbox.next(lambda m: m[:1] in "*?" and (identity or not self._is_identity(m)), ANSWER_S)
+        self._owed = line is None
         if line is None:
             problem = f"did not answer ${command} within {ANSWER_S:g} s"
             raise NoAnswer(self.link.url, self.link.device, problem, "check cable, power and baud rate of the meter")
@@ -54,7 +58,7 @@ class OphirMeter:
         """Answers come in order: once the meter has said who it is, no older answer can come any more."""
         self._inbox.drain(QUIET_S)
         self.link.write(b"$II\r\n")
-        self._inbox.next(self._is_identity, RESYNC_S)
+        self._owed = self._inbox.next(self._is_identity, RESYNC_S) is None
 
     def _ask(self, command: str, parse: Callable[[str], T]) -> T:
         def attempt() -> T:

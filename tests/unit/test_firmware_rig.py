@@ -67,7 +67,7 @@ def test_commands_of_an_image_fit_into_the_discarded_frame() -> None:
     with emulated.serial_rig() as rig:
         for u in (1900, 4095, 0):
             start = clock.now()
-            rig.projector.move(u, 2000)
+            rig.projector.move(2000, u)
             assert emulated.bench.board.settled(clock.now())
             rig.lasers[0].open_gate()
             rig.cameras[0].expose()

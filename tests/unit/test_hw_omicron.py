@@ -122,6 +122,20 @@ def test_an_interlock_that_opens_is_named_and_needs_a_reset() -> None:
     laser.emit()
 
 
+def test_arming_resets_an_interlock_that_is_closed_again_and_no_other() -> None:
+    bench = LaserBench()
+    laser = emitting(bench)
+    bench.head.set_interlock(closed=False)
+    with pytest.raises(DeviceFault, match="the interlock is open"):
+        laser.arm(40.0)
+    bench.head.set_interlock(closed=True)
+    laser.arm(40.0)
+    laser.emit()
+    bench.head.fail(1 << 12 | 1 << 0)
+    with pytest.raises(DeviceFault, match="the diode's temperature is out of range"):
+        laser.arm(40.0)
+
+
 def test_the_key_is_named() -> None:
     bench = LaserBench()
     laser = emitting(bench)
@@ -229,16 +243,26 @@ def test_a_late_answer_never_answers_the_next_question() -> None:
         assert first == [pytest.approx(40.0)]
 
 
+def test_an_answer_that_comes_twice_answers_once() -> None:
+    bench = LaserBench()
+    laser = emitting(bench)
+    bench.line.answer_faults.append(lambda data: [(0.0, data + data)])
+    assert laser.measured_mw() == pytest.approx(40.0)
+    bench.head.level = 0.7
+    assert laser.measured_mw() == pytest.approx(70.0)
+
+
 def test_emission_is_not_asked_for_twice() -> None:
     """LOn is no setting: when its answer is lost, the status says whether it was understood."""
     bench = LaserBench()
     laser = bench.connect()
     laser.arm(40.0)
     asked = []
-    bench.line.command_faults.append(lambda data: (asked.append(data), data)[1])
+    bench.line.command_faults.extend([lambda data: (asked.append(data), data)[1]] * 100)
     bench.line.answer_faults.append(lost)
     laser.emit()
-    assert asked == [b"?LOn\r"]
+    assert asked[0] == b"?LOn\r"
+    assert asked.count(b"?LOn\r") == 1
     assert laser.measured_mw() == pytest.approx(40.0)
 
 

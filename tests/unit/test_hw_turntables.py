@@ -164,15 +164,33 @@ def test_faults_are_named(what: str, message: str) -> None:
         table.move(1.0)
 
 
+def test_what_has_no_checksum_is_not_trusted_once_checksums_are_on() -> None:
+    """Not even with the number of the present command."""
+    bench = TableBench()
+    table = bench.connect()
+    table.home()
+    number = f"{(table._id + 1) % 100:02d}"
+    bench.line.answer_faults.append(after(f"@01 1 {number} OK IDLE -- 77\r\n".encode()))
+    assert table.angle_rad() == 0.0
+
+
 def test_answers_to_older_commands_are_recognised_by_their_number() -> None:
     bench = TableBench()
     table = bench.connect()
     table.home()
-    bench.line.answer_faults.append(late(0.55))
-    bench.spindle.go(90.0, bench.now())
-    bench.clock.sleep(5.0)
-    bench.line.say(b"@01 1 " + f"{(table._id + 1) % 100:02d}".encode() + b" OK IDLE -- 77\r\n")  # without checksum
-    assert table.angle_rad() == pytest.approx(np.pi / 2)
+    body = f"01 1 {table._id:02d} OK IDLE -- 77"
+    bench.line.answer_faults.append(after(f"@{body}:{checksum(body)}\r\n".encode()))
+    assert table.angle_rad() == 0.0
+
+
+@BOTH
+def test_standing_still_elsewhere_is_not_arriving(make: Callable[[], Bench]) -> None:
+    bench = make()
+    table = bench.connect()
+    table.home()
+    bench.spindle.on_move = lambda angle: setattr(bench.spindle, "angle_deg", angle - 1.0)
+    with pytest.raises(DeviceFault, match=r"turntable stopped at 119\.0+ deg instead of 120\.0+ deg"):
+        table.move(np.deg2rad(120.0))
 
 
 def test_bad_checksums_are_dropped_by_both_sides() -> None:
