@@ -160,7 +160,6 @@ class MirrorBoard:
 
     def shut_now(self) -> None:
         """Say so without waiting for anything, first of all when something is wrong."""
-        self._owed = True
         self.link.write(bytes([*RESTART, SET_LINES, 0]))
 
     def lines(self) -> int:
