@@ -21,6 +21,7 @@ T = TypeVar("T")
 BAUD = 9600
 ANSWER_S = 0.5
 HOME_S = 20.0
+PATIENCE_S = 5.0  # most moves have ended by then
 QUIET_S = 0.3
 RESYNC_S = 3.0
 ROTARY = {0x0E: "ELL14", 0x12: "ELL18"}
@@ -142,24 +143,29 @@ class ElliptecTable:
         self._go(f"ma{target:08X}", angle, target, self.reach_s)
 
     def _go(self, command: str, angle_deg: float, target: int, limit_s: float) -> None:
-        """Start, wait for the end of the motion, compare the place; a lost answer does not start it again."""
+        """Move and compare the place; once more if it is another: a command may be lost, and moving twice does no harm."""
+        end = self.link.clock.now() + limit_s
+        for _ in range(2):
+            self._turn(command, angle_deg, end, limit_s)
+            found = self._position()
+            away = (found - target + self._pulses // 2) % self._pulses - self._pulses // 2
+            if abs(away) <= max(2, round(self._pulses / 3600)):  # 0.1 deg: what the stage repeats to
+                return
+        problem = f"stopped at {found / self._pulses * 360.0:.2f} deg instead of {angle_deg:.2f} deg"
+        remedy = "check that nothing blocks the table, then home it again"
+        raise DeviceFault(self.link.url, self.link.device, problem, remedy)
+
+    def _turn(self, command: str, angle_deg: float, end: float, limit_s: float) -> None:
+        """Start, and wait for the answer at the end of the motion; if it does not come, ask."""
         clock = self.link.clock
-        end = clock.now() + limit_s
         try:
-            self._check(self._once(command, "PO", limit_s))
+            self._check(self._once(command, "PO", min(limit_s, PATIENCE_S)))
         except NoAnswer:
             while (code := self._ask("gs", "GS", _code)) == BUSY:
                 if clock.now() > end:
                     raise not_reached(self.link, angle_deg, limit_s, "it is still turning") from None
                 clock.sleep(POLL_S)
             self._check(f"GS{code:02X}")
-        tolerance = max(2, round(self._pulses / 3600))  # 0.1 deg: what the stage repeats to
-        found = self._position()
-        away = (found - target + self._pulses // 2) % self._pulses - self._pulses // 2
-        if abs(away) > tolerance:
-            problem = f"stopped at {found / self._pulses * 360.0:.2f} deg instead of {angle_deg:.2f} deg"
-            remedy = "check that nothing blocks the table, then home it again"
-            raise DeviceFault(self.link.url, self.link.device, problem, remedy)
 
     def _check(self, answer: str) -> None:
         if answer.startswith("GS") and answer != "GS00":

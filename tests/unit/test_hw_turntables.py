@@ -112,6 +112,18 @@ def test_one_bad_answer_does_not_stop_or_misplace_it(make: Callable[[], Bench], 
 
 
 @BOTH
+@pytest.mark.parametrize("place", range(1, 8))
+def test_one_lost_command_is_given_again(make: Callable[[], Bench], place: int) -> None:
+    bench = make()
+    bench.line.command_faults.extend([None] * place + [lambda _: b""])
+    table = bench.connect()
+    table.home()
+    for angle in (120.0, 240.0):
+        table.move(np.deg2rad(angle))
+        assert degrees(bench) == pytest.approx(angle, abs=0.003)
+
+
+@BOTH
 def test_unplugging(make: Callable[[], Bench]) -> None:
     bench = make()
     table = bench.connect()
