@@ -23,7 +23,8 @@ from hw.devices.elliptec import BAUD as ELLIPTEC_BAUD
 from hw.devices.elliptec import ElliptecTable
 from hw.devices.mm_ard import BAUD as BOARD_BAUD
 from hw.devices.mm_ard import LINES, MirrorBoard
-from hw.devices.omicron import Mode, OmicronLaser
+from hw.devices.omicron import OmicronLaser
+from hw.devices.omicron_protocol import Mode
 from hw.devices.ophir import BAUD as OPHIR_BAUD
 from hw.devices.ophir import OphirMeter
 from hw.devices.turning import Table

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from disco_twin.firmware.wire import Timed
-from hw.devices.omicron import LEVELS, USB_BAUD, Mode, Status
+from hw.devices.omicron_protocol import LEVELS, USB_BAUD, Mode, Status
 
 LATENCY_S = 0.015
 EMISSION_S = 3.0  # from LOn to light

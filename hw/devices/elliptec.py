@@ -143,7 +143,7 @@ class ElliptecTable:
         self._go(f"ma{target:08X}", angle, target, self.reach_s)
 
     def _go(self, command: str, angle_deg: float, target: int, limit_s: float) -> None:
-        """Move and compare the place; once more if it is another: a command may be lost, and moving twice does no harm."""
+        """Move and compare the place; once more if it is another: a command may be lost, and repeating it is safe."""
         end = self.link.clock.now() + limit_s
         for _ in range(2):
             self._turn(command, angle_deg, end, limit_s)

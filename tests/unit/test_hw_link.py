@@ -15,7 +15,8 @@ from disco_twin.firmware.wire import lost
 from hw.bytelog import HEADER, ByteLog, Event, ReplayPeer, read_log
 from hw.clock import VirtualClock
 from hw.devices.elliptec import ElliptecFramer
-from hw.devices.omicron import OmicronFramer, OmicronLaser
+from hw.devices.omicron import OmicronLaser
+from hw.devices.omicron_protocol import OmicronFramer
 from hw.devices.zaber import ZaberFramer, checksum, parse
 from hw.errors import DiscoError, InputError, Unplugged
 from hw.ports.protocol_memory import attach

@@ -10,7 +10,8 @@ from serial_fakes import BoardBench, LaserBench, TableBench
 
 from disco_twin.firmware.omicron import LaserHead, OmicronFirmware
 from disco_twin.firmware.wire import Fault, after, broken_by, garbled, late, lost, split
-from hw.devices.omicron import OmicronLaser, Status
+from hw.devices.omicron import OmicronLaser
+from hw.devices.omicron_protocol import Status
 from hw.errors import DeviceError, DeviceFault, DeviceRefused, Garbled, NoAnswer, Unplugged, WrongDevice
 
 
