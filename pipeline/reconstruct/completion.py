@@ -34,6 +34,7 @@ log = logging.getLogger(__name__)
 # Chosen by leaving a fifth of the spots out, without the truth (docs/decisions/0013); lengths in edges of the scan.
 RANGE_EDGES = 2.0  # correlation length of G
 NEAR, FAR, TURN_EDGES = 0.08, 0.6, 3.6  # s(distance): relative deviation of R_d from the profile
+BOTH_ENDS = 2 * ANGULAR**2  # relative variance of any entry that directions leave, in and out
 ROUNDS = 2  # of Gauss-Newton, for each of as many fits of the profile
 TOLERANCE = 1e-2  # of conjugate gradients; every solve starts from the one before
 MOST_STEPS = 300
@@ -135,8 +136,10 @@ def fit_laser(samples: Samples, laser: int, field: SymmetricField, start: F32) -
     return Fit(entries, pairs.mean(profile) * np.exp(smooth), tilt, y)
 
 
-def hold_measured(samples: Samples, fits: list[Fit]) -> tuple[F64, F64, NDArray[np.bool_]]:
+def hold_measured(samples: Samples, fits: list[Fit], lift: F64) -> tuple[F64, F64, NDArray[np.bool_]]:
     """(L, V, V) R_d that holds the samples where they are good, its relative variance, and (V, V) where that is.
+
+    lift: (V, V) expectation over the fit, where the fit stands alone.
 
     A sample is the mean over a beam and a hat function in one direction, an entry the mean over two hat functions and
     all directions. The fit says what lies between: sample / its expectation = entry / its expectation. Spots whose
@@ -166,8 +169,8 @@ def hold_measured(samples: Samples, fits: list[Fit]) -> tuple[F64, F64, NDArray[
         ratios.append((ratio + ratio.T) / total)
         variances.append((spread + spread.T) / total**2)
         held &= (variances[-1] < limit) & (ratios[-1] > 0)
-    entries = np.stack([fit.entries * np.where(held, ratio, 1.0) for fit, ratio in zip(fits, ratios, strict=True)])
-    return entries, np.stack(variances) + ANGULAR**2, held
+    entries = np.stack([fit.entries * np.where(held, ratio, lift) for fit, ratio in zip(fits, ratios, strict=True)])
+    return entries, np.stack(variances) + BOTH_ENDS, held
 
 
 def unexplained(samples: Samples, basis: Harmonics, range_mm: float) -> F64:
@@ -204,9 +207,11 @@ def complete(samples: Samples) -> ReflectanceModel:
     fits: list[Fit] = []
     for laser in range(len(samples.values)):
         fits.append(fit_laser(samples, laser, field, fits[-1].field if fits else np.zeros_like(field.penalty)))
-    reflectance, relative, held = hold_measured(samples, fits)
     edges = samples.vertex_pairs.distance / edge
-    filled = deviation(edges) ** 2 * unexplained(samples, basis, RANGE_EDGES * edge) + scatter(edges) ** 2
+    left = deviation(edges) ** 2 * unexplained(samples, basis, RANGE_EDGES * edge)
+    # What is left open about log R_d raises the expectation of R_d: the mean of a log-normal.
+    reflectance, relative, held = hold_measured(samples, fits, np.exp(0.5 * left))
+    filled = left + BOTH_ENDS
 
     def expected(glow: Glow) -> F64:
         tilt = sum(outward_tilt(samples.mesh, samples.spots, glow.camera.position))
