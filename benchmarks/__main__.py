@@ -19,7 +19,9 @@ from typing import Any
 from pipeline.resources import measured, usable_cores
 
 REGISTRY = {
+    "faults": "benchmarks.faults",
     "irradiance": "benchmarks.irradiance",
+    "laser-safety": "benchmarks.laser_safety",
     "pareto": "benchmarks.pareto",
     "stream": "benchmarks.stream",
     "walk": "benchmarks.walk",

@@ -77,6 +77,7 @@ class Emulation:
             self.bench.cameras,
             self.clock,
             flood_line=FLOOD_LINE,
+            armed_line=FLOOD_LINE - 1,
             timebase=self.bench,
             announce=self.bench.twin.announce,
             centre=(steps // 2, steps // 2),
