@@ -70,6 +70,40 @@ def capture(
                 capture_with_devices(opened, open_rig_file(opened, rig, arm), rig, logs)
 
 
+@app.command("import")
+def import_(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="capture.toml, images.csv and 16-bit frames.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The capture that `python -m pipeline` reads.")],
+) -> None:
+    """Turn a capture that was made without this software into ours. Needs no renderer."""
+    from disco_twin.console import stage_bar
+    from pipeline.capture.imported import import_capture
+
+    with stage_bar(console, "import", "images") as report:
+        plan_ = import_capture(folder, out, report)
+    console.print(f"{len(plan_)} images, {plan_.views} views, {len(plan_.spots)} spots", highlight=False)
+
+
+@app.command()
+def quality(
+    capture_folder: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture: DIR/capture of a run.")],
+) -> None:
+    """Show the quality of a capture view by view, finished or not. Needs no renderer."""
+    from disco_twin.console import quality_table
+    from pipeline.capture.quality import examine
+    from pipeline.capture.stream import StreamReader
+    from pipeline.config import read_json
+    from pipeline.records import SensorFile
+
+    sensor = read_json(capture_folder / "sensor.json", SensorFile, "give the folder `capture` of a run").sensor
+    with StreamReader(capture_folder) as stream:
+        views = list(examine(stream, sensor))
+    console.print(quality_table(views))
+    for view in views:
+        for remark in view.remarks:
+            console.print(f"view {view.view}: {remark}", highlight=False, soft_wrap=True)
+
+
 @app.command()
 def reconstruct(out: RunOut, methods: MethodsOption = None) -> None:
     """Reconstruct and relight a capture. Needs no renderer."""
