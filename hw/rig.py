@@ -22,6 +22,8 @@ from hw.interface import Aim, Camera, Floodlight, Laser, Photodiode, Projector, 
 log = logging.getLogger(__name__)
 
 HEARD_S = 0.02  # until what was told without waiting for an answer has been understood
+OPENINGS = 3
+PROMPT_S = 0.1  # a line is set in a few milliseconds; a reply that is waited for in vain takes longer
 SETTLE_S = 0.005  # of the galvos, after the DAC has taken both values
 
 
@@ -133,7 +135,7 @@ class SerialRig:
         self._warm_up_s, self._power_tolerance = warm_up_s, power_tolerance
         self._timebase: Timebase = Elapsed(clock) if timebase is None else timebase
         self._devices: Devices | None = None
-        self._pattern, self._last_open = 0, -1
+        self._pattern, self._last_open, self._aim = 0, -1, centre
         self.lasers: Sequence[Laser] = [GatedLaser(self, i) for i in range(len(self.wiring))]
         self.projector: Projector = Mirrors(self)
         self.turntable: Turntable = Turning(self)
@@ -149,8 +151,7 @@ class SerialRig:
         try:
             devices.board.shut()
             self._pattern = 0
-            devices.board.set_mirrors(*self._centre)
-            self.clock.sleep(SETTLE_S)
+            self.aim(*self._centre)
             devices.table.home()
             for head, wiring in zip(devices.heads, self.wiring, strict=True):
                 head.arm(wiring.power_mw)
@@ -239,6 +240,30 @@ class SerialRig:
         board.set_lines(after)
         self._pattern = after
 
+    def open_line(self, line: int) -> None:
+        """Open a gate, being certain that the mirrors still stand where they were told to.
+
+        A board that is reset forgets them, and its armed line falls, until lines are set again: so it is looked at
+        before. If setting the line had to be repeated, a reset may hide in between: then the mirrors are aimed anew.
+        """
+        for _ in range(OPENINGS):
+            self.require_lines()
+            begun = self.clock.now()
+            self.switch(line, True)
+            if self.clock.now() - begun < PROMPT_S:
+                return
+            log.warning("the mirror board was slow to open a gate: shutting it and aiming anew")
+            self.switch(line, False)
+            self.aim(*self._aim)
+        problem = f"did not open a gate promptly in {OPENINGS} attempts"
+        raise DeviceFault("board", "the mirror board", problem, "check its cable and power supply")
+
+    def aim(self, u: int, v: int) -> None:
+        """Mirror steps; returns when the mirrors have settled."""
+        self.devices().board.set_mirrors(u, v)
+        self._aim = (u, v)
+        self.clock.sleep(SETTLE_S)
+
     def require_lines(self) -> None:
         """Refuse an image during which the board was reset: gates and mirrors have moved."""
         found = self.devices().board.lines()
@@ -280,7 +305,7 @@ class GatedLaser:
         if self.rig.open_gate not in (-1, self.index):
             raise Refused(f"the gate of laser {self.rig.open_gate} is open: one laser at a time")
         self.rig.opened(self.index)
-        self.rig.switch(self.rig.wiring[self.index].gate_line, True)
+        self.rig.open_line(self.rig.wiring[self.index].gate_line)
 
     def close_gate(self) -> None:
         """Shut this gate; always allowed."""
@@ -297,8 +322,7 @@ class Mirrors:
     def move(self, u: int, v: int) -> None:
         """Aim at mirror steps (u, v); returns when the mirrors have settled."""
         self.rig.require_dark("projector")
-        self.rig.devices().board.set_mirrors(u, v)
-        self.rig.clock.sleep(SETTLE_S)
+        self.rig.aim(u, v)
 
 
 @dataclass

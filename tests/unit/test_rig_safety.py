@@ -1,0 +1,247 @@
+"""Safety of the serial rig: arming, read-back, a board that was reset, everybody told before anybody has to confirm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_fakes import contents
+from test_capture_twin import PLAN, RIG, Glow
+
+from disco_twin.cli import main
+from disco_twin.firmware.emulate import Emulation
+from disco_twin.rig import TwinRig
+from disco_twin.rig_commands import rig_file_of, selftest, served
+from disco_twin.rig_file import load_rig_file
+from hw.errors import DeviceFault, DiscoError
+from hw.interface import gate_open
+from hw.rig import Refused
+from pipeline.capture.loop import capture
+from pipeline.rig import RigConfig
+
+
+def emulation() -> Emulation:
+    return Emulation(TwinRig(RIG, Glow(), seed=5))
+
+
+def at_image(emulated: Emulation, number: int, action: Callable[[], None]) -> None:
+    """Do something just before an exposure."""
+    count = 0
+    for camera in emulated.bench.cameras:
+        expose = camera.expose
+
+        def counted(expose: Callable[[], object] = expose) -> object:
+            nonlocal count
+            count += 1
+            if count == number:
+                action()
+            return expose()
+
+        camera.expose = counted  # type: ignore[method-assign,assignment]
+
+
+def reset(emulated: Emulation) -> None:
+    """The board forgets its lines and its mirrors, and listens again at once."""
+    emulated.bench.board.set_pattern(0)
+    for galvo in emulated.bench.board.galvos:
+        galvo.aim(0, emulated.clock.now())
+
+
+def at_message(emulated: Emulation, wanted: Callable[[bytes, int], bool], action: Callable[[], None]) -> None:
+    """Do something, and lose the message, when the board is sent a certain one."""
+    line, number = emulated.lines["board"], 0
+    receive = line.receive
+
+    def received(data: bytes) -> None:
+        nonlocal number
+        number += data[:1] == b"\x03"  # mirrors: two messages an aim
+        if wanted(data, number):
+            wanted_once.append(True)
+            if len(wanted_once) == 1:
+                action()
+                return
+        receive(data)
+
+    wanted_once: list[bool] = []
+    line.receive = received  # type: ignore[method-assign]
+
+
+def test_a_board_that_was_reset_never_gives_an_image(tmp_path: Path) -> None:
+    """It forgets gates and mirrors. In an exposure, in the floodlight, and after the mirrors have been aimed."""
+    whole = tmp_path / "whole"
+    capture(TwinRig(RIG, Glow(), seed=5), PLAN, whole)
+    for number, when in enumerate(("exposure", "floodlight", "aimed")):
+        emulated, parts = emulation(), tmp_path / when
+        if when == "aimed":  # the lines are read (2) before the gate opens for the second spot
+            at_message(emulated, lambda data, n: n == 6 and data[:1] == b"\x02", lambda e=emulated: reset(e))  # type: ignore[misc]
+        else:
+            at_image(emulated, 1 if when == "floodlight" else 4, emulated.lines["board"].power_cycle)
+        with pytest.raises(DiscoError, match="Remedy"):
+            capture(emulated.serial_rig(), PLAN, parts)
+        assert emulated.bench.light() == [] and not any(h.on_since for h in emulated.bench.heads)
+        assert capture(emulation().serial_rig(), PLAN, parts).resumed_at == (3, 0, 4)[number]
+        assert contents(parts) == contents(whole)
+
+
+def test_a_reset_that_hides_behind_a_lost_answer_is_made_good(tmp_path: Path) -> None:
+    """The command that opens the gate for the second spot is lost in a reset: aimed anew, the image is right."""
+    whole, serial = tmp_path / "whole", tmp_path / "serial"
+    capture(TwinRig(RIG, Glow(), seed=5), PLAN, whole)
+    emulated = emulation()
+    at_message(emulated, lambda data, n: n == 6 and data[:1] == b"\x01" and data[1] != 0, lambda: reset(emulated))
+    capture(emulated.serial_rig(), PLAN, serial)
+    assert contents(serial) == contents(whole)
+
+
+def test_everybody_is_told_before_anybody_has_to_confirm() -> None:
+    """A board that has fallen silent must not delay the lasers."""
+    emulated = emulation()
+    rig = emulated.serial_rig()
+    rig.__enter__()
+    emulated.lines["board"].answer_faults.extend([lambda data: []] * 99)
+    begun, off = emulated.clock.now(), []
+    for head in emulated.bench.heads:
+        assert head.on_since is not None
+    sleep = emulated.clock.sleep
+
+    def watched(seconds: float) -> None:
+        sleep(seconds)
+        if not off and all(head.on_since is None for head in emulated.bench.heads):
+            off.append(emulated.clock.now())
+
+    emulated.clock.sleep = watched  # type: ignore[method-assign]
+    rig.make_safe()
+    assert off and off[0] - begun < 0.1
+    assert emulated.bench.board.lines == 0
+
+
+def test_one_gate_at_a_time_and_none_during_moves() -> None:
+    emulated = emulation()
+    with emulated.serial_rig() as rig:
+        with gate_open(rig.lasers[1]):
+            with pytest.raises(Refused, match="one laser at a time"):
+                rig.lasers[0].open_gate()
+            for move in (lambda: rig.projector.move(1, 2), lambda: rig.turntable.move(0.0)):
+                with pytest.raises(Refused, match="must not move while the gate of laser 1 is open"):
+                    move()
+        with pytest.raises(RuntimeError), gate_open(rig.lasers[2]):
+            raise RuntimeError
+        assert emulated.bench.light() == []
+    assert emulated.bench.hazards == []
+
+
+def test_the_photodiode_is_compared_with_the_set_point() -> None:
+    emulated = emulation()
+    with emulated.serial_rig() as rig, gate_open(rig.lasers[0]):
+        rig.cameras[0].expose()
+        emulated.bench.heads[0].set_interlock(closed=False)
+        with pytest.raises(DeviceFault, match=r"gives 0.00 mW at the photodiode instead of 10 mW"):
+            rig.photodiode.read()
+
+
+# ---- the commands
+
+
+def text(scene: RigConfig = RIG, **ports: str) -> str:
+    return rig_file_of(scene, ports)
+
+
+SCENE = """
+format_version = 1
+name = "bench"
+[object.shape]
+kind = "sphere"
+radius_mm = 15.0
+[object.medium.base]
+kind = "homogeneous"
+sigma_t_per_mm = 1.3
+albedo = [0.99, 0.99, 0.99]
+[rig]
+spots = 6
+turntable_angles_deg = [0.0]
+[[rig.cameras]]
+name = "front"
+position_mm = [450.0, 60.0, 100.0]
+width = 48
+height = 31
+pixel_pitch_um = 176.0
+[[relight.views]]
+name = "left"
+position_mm = [150.0, 400.0, 110.0]
+[[relight.views]]
+name = "right"
+position_mm = [-375.0, -190.0, 95.0]
+"""
+
+
+def test_real_lasers_are_armed_explicitly(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene, rig = tmp_path / "scene.toml", tmp_path / "rig.toml"
+    scene.write_text(SCENE)
+    config = RigConfig(cameras=(RIG.cameras[0],))
+    rig.write_text(rig_file_of(config, {"laser1": "/dev/ttyUSB7"}))
+    with pytest.raises(SystemExit) as end:
+        main(["capture", str(scene), "--out", str(tmp_path / "out"), "--rig", str(rig)])
+    assert end.value.code == 2
+    said = capsys.readouterr().err
+    assert "real lasers will emit (/dev/ttyUSB7)" in said and "--arm" in said and said.count("\n") == 1
+
+
+def test_probe_and_selftest_of_served_devices(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("disco_twin.firmware.omicron.EMISSION_S", 0.05)
+    monkeypatch.setattr("disco_twin.firmware.turning.SPEED_DEG_S", 720.0)
+    monkeypatch.setattr("hw.devices.mm_ard.BOOT_S", 0.05)
+    with served(RIG, 3, tmp_path / "ports") as path:
+        with pytest.raises(SystemExit) as end:
+            main(["rig", "probe", str(path), "--logs", str(tmp_path / "logs")])
+        said = capsys.readouterr().out
+        assert end.value.code == 0 and said.count("ok  ") == 5 and "LuxX 532 nm, 10 mW" in said
+        assert len(list((tmp_path / "logs").iterdir())) == 5
+        findings = list(selftest(load_rig_file(path), None, armed=True))
+        assert all(f.good for f in findings) and len(findings) == 7
+        assert sum("own reading 10.00 mW, photodiode 10.0" in f.text for f in findings) == 3
+        board = Path(path.parent, "board")
+        file = path.read_text().replace(f'"{board}"', f'"{path.parent / "laser0"}"').replace("laser0", "laser9", 1)
+        (tmp_path / "wrong.toml").write_text(file)
+        with pytest.raises(SystemExit) as end:
+            main(["rig", "probe", str(tmp_path / "wrong.toml")])
+        said = capsys.readouterr().out
+        assert end.value.code == 1
+        assert said.count("FAIL") == 2 and "is not an MM-Ard board" in said and "laser9" in said
+        assert "Traceback" not in said and said.count("Remedy") == 2
+
+
+def test_nothing_real_is_said_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rig.toml").write_text(text())
+    with pytest.raises(SystemExit) as end:
+        main(["rig", "probe", str(tmp_path / "rig.toml")])
+    assert end.value.code == 0 and "nothing to connect to" in capsys.readouterr().out.replace("\n", "")
+
+
+def test_devices_capture_into_a_run_folder_and_nothing_simulates_over_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`capture --rig` with everything emulated, the light being a stand-in; then the twin leaves the folder alone."""
+    scene, rig, out = tmp_path / "scene.toml", tmp_path / "rig.toml", tmp_path / "out"
+    scene.write_text(SCENE)
+    rig.write_text(rig_file_of(RigConfig(cameras=(RIG.cameras[0],)), {}))
+    monkeypatch.setattr("disco_twin.simulate.twin_rig", lambda world, folder: TwinRig(world.scene.rig, Glow(), 5))
+
+    def command(*words: str) -> tuple[int, str]:
+        with pytest.raises(SystemExit) as end:
+            main([*words])
+        captured = capsys.readouterr()
+        return int(end.value.code or 0), captured.out + captured.err
+
+    status, said = command("capture", str(scene), "--out", str(out), "--rig", str(rig))
+    assert status == 0, said
+    images = (out / "capture" / "images.bin").read_bytes()
+    monkeypatch.setattr("disco_twin.run.light_key", lambda run: "changed code")
+    assert command("capture", str(scene), "--out", str(out))[0] == 0
+    assert (out / "capture" / "images.bin").read_bytes() == images
+    status, said = command("quality", str(out / "capture"))
+    assert status == 0 and "19/19" in said
+    assert np.isfinite(len(images))
