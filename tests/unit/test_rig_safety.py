@@ -90,7 +90,8 @@ def test_a_reset_that_hides_behind_a_lost_answer_is_made_good(tmp_path: Path) ->
     whole, serial = tmp_path / "whole", tmp_path / "serial"
     capture(TwinRig(RIG, Glow(), seed=5), PLAN, whole)
     emulated = emulation()
-    at_message(emulated, lambda data, n: n == 6 and data[:4] == b"\0\0\0\x01" and data[4] & 7 > 0, lambda: reset(emulated))
+    opening = b"\0\0\0\x01"
+    at_message(emulated, lambda data, n: n == 6 and data[:4] == opening and data[4] & 7 > 0, lambda: reset(emulated))
     capture(emulated.serial_rig(), PLAN, serial)
     assert contents(serial) == contents(whole)
 
