@@ -7,7 +7,7 @@ from pipeline.resources import usable_cores
 
 # Measured on an earlier quick.toml (alpha .3, mean free path about 1.7 mm, twice today's), per core and second; other
 # media scale with the number of collisions, so this is a guess within a factor of two or three.
-SPOT_WALKS, TRUTH_WALKS, REFERENCE_WALKS = 100_000.0, 200_000.0, 60_000.0
+SPOT_WALKS, TRUTH_WALKS, REFERENCE_WALKS = 100_000.0, 50_000.0, 60_000.0
 COMPRESSION = 7.0  # docs/decisions/0002
 IMAGES_PER_S = 15.0  # of the real rig (thesis 4.1)
 BYTES_PER_PIXEL = 3

@@ -37,7 +37,7 @@ class SimulationConfig(Strict):
 
     walks_per_spot: Count = 200_000
     truth_columns: Count = 24  # scan vertices whose column of R_d is computed as ground truth
-    truth_walks: Count = 2_000_000  # a column
+    truth_walks: Count = 500_000  # a column, with weight windows
     reference_walks: Count = 20_000_000  # a light, both halves together
 
 

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from disco_twin.light import tables as kernel
 from disco_twin.light.balance import EnergyBalance
 from disco_twin.light.distance import build_distance_field
+from disco_twin.light.importance import Diffusion, Splitting, diffusion, window_targets
 from disco_twin.light.sources import Source, opaque3, to_float, weight_type
+from disco_twin.light.splitting import Window
 from disco_twin.light.walk import Balance, walk
 from disco_twin.object.build import Medium, TwinObject
 from pipeline.calibrate.camera import PinholeCamera
@@ -81,6 +83,7 @@ class Transport:
         }  # fmt: skip
         self.scene = mesh_scene(self.vertices, self.faces, bsdfs[obj.boundary.kind])
         self._cells = cells
+        self._diffusion: dict[int, Diffusion] = {}
 
     @cached_property
     def _shared(self) -> dict[str, Any]:
@@ -134,6 +137,22 @@ class Transport:
             medium_scale=opaque3(mi.Vector3f, np.array([nx, ny, nz]) / size),
         )
 
+    def _window(self, group: Sequence[int], split: Splitting) -> Window:
+        """The tags' weight windows; tags whose light enters at one place share a map."""
+        absorbed = [float((self.object.medium.sigma_t[k] * (1 - self.object.medium.albedo[k])).mean()) for k in group]
+        laser = group[int(np.argmin(absorbed))]  # the others' light is fainter everywhere
+        if laser not in self._diffusion:
+            self._diffusion[laser] = diffusion(self.object, laser)
+        estimate = self._diffusion[laser]
+        places, maps = np.unique(split.entries, axis=0, return_inverse=True)
+        return Window(
+            target=to_float(window_targets(estimate.fluence(places), estimate.filled, split.effort)),
+            maps=mi.UInt32(maps.ravel().astype(np.uint32)),
+            cells=len(estimate.number),
+            low=opaque3(mi.Point3f, estimate.low),
+            inverse_cell=dr.opaque(mi.Float, 1 / estimate.cell),
+        )
+
     def trace(
         self,
         make_source: Callable[[Sequence[int]], Source],
@@ -147,16 +166,18 @@ class Transport:
         deposit: bool = False,
         first: int = 0,
         lanes: int = LANES,
+        split: Splitting | None = None,
     ) -> Traced:
         """Walk `walks` photons (numbers `first`...) of each of `tags` tags.
 
         make_source: (group of laser indices) -> Source. streams: (T,) names of the tags' random streams, so that a
-        spot gives the same image whatever it is traced together with; 0, 1, 2, ... by default.
+        spot gives the same image whatever it is traced together with; 0, 1, 2, ... by default. split: weight windows,
+        which make faint light as precise as bright (importance.py).
         """
         streams = np.arange(tags, dtype=np.uint32) if streams is None else streams.astype(np.uint32)
         parts = [
             self._trace_group(
-                make_source(group), group, tags, walks, seed, streams, cameras, layers, deposit, first, lanes
+                make_source(group), group, tags, walks, seed, streams, cameras, layers, deposit, first, lanes, split
             )
             for group in self.groups
         ]
@@ -179,6 +200,7 @@ class Transport:
     def _trace_group(
         self, source: Source, group: Sequence[int], tags: int, walks: int, seed: int, streams: NDArray[np.uint32],
         cameras: Sequence[PinholeCamera], layers: int, deposit: bool, first: int, lanes: int,
+        split: Splitting | None,
     ) -> Traced:  # fmt: skip
         tables = self._tables(group)
         table = camera_table(cameras) if cameras else None
@@ -192,6 +214,7 @@ class Transport:
         )
         batch = max(1, min(tags, ACCUMULATOR_BYTES // max(per_tag, 1), (1 << 31) // max(walks, 1)))
         names = mi.UInt32(streams)
+        window = self._window(group, split) if split is not None else None
         total = {name: np.zeros(len(group)) for name in Balance.__dataclass_fields__}
         images, variances, deposits = [], [], []
         for low in range(0, tags, batch):
@@ -205,7 +228,7 @@ class Transport:
                 balance = walk(
                     tables, source, table, pictures, powers, dr.opaque(mi.UInt32, n * m), dr.opaque(mi.UInt32, m),
                     dr.opaque(mi.UInt32, first + start), dr.opaque(mi.UInt32, low), names,
-                    dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), dr.opaque(mi.Float, 1.0 / source.scale), lanes,
+                    dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), dr.opaque(mi.Float, 1.0 / source.scale), window, lanes,
                 )  # fmt: skip
                 dr.eval(balance)
                 for name in total:

@@ -96,9 +96,11 @@ def truth_columns(
 
     basis: (V_fine, V) the hat functions' values at the vertices of the mesh that light is traced on; walks: a column.
     """
+    from disco_twin.light.importance import Splitting
     from disco_twin.light.sources import HatSource  # what is stored can be read without a renderer
 
     hats = np.repeat(basis[:, columns].toarray().T, REPLICATES, axis=0)
+    entries = (hats @ transport.vertices) / hats.sum(axis=1, keepdims=True)
 
     def source(group: Sequence[int]) -> HatSource:
         return HatSource(transport.vertices, transport.faces, hats, len(group))
@@ -106,7 +108,9 @@ def truth_columns(
     replicate = np.tile(np.arange(REPLICATES), len(columns))
     names = (np.repeat(columns, REPLICATES) * REPLICATES + replicate).astype(np.uint32)
     per_replicate = max(1, round(walks / REPLICATES))
-    traced = transport.trace(source, len(hats), per_replicate, seed=seed, streams=names, deposit=True)
+    traced = transport.trace(
+        source, len(hats), per_replicate, seed=seed, streams=names, deposit=True, split=Splitting(entries)
+    )
     assert traced.deposits is not None
     n, lasers = len(columns), transport.lasers
     power = np.stack([(basis.T @ deposit.T).T for deposit in traced.deposits])  # (n * replicates, L, V)

@@ -7,6 +7,7 @@ written for Dr.Jit's symbolic loops:
 - *distance skip*: a flight that stays within two empty balls needs no intersection test (distance.py);
 - *inner collisions*: up to `INNER` collisions per outer step, so that surface code does not run for one lane in
   sixteen;
+- *weight windows*: Russian roulette, and with a map splitting within the photon's history (splitting.py);
 - *one walk, all wavelengths*: wavelengths that share sigma_t and g differ in albedo alone, so one photon carries a
   weight for each;
 - *lobe connection*: of the collisions of an outer step that lie near the surface one is drawn (reservoir) and connects
@@ -31,6 +32,7 @@ from disco_twin.light import sampling
 from disco_twin.light.connect import connect_exit, connect_lobes
 from disco_twin.light.sampling import Rng
 from disco_twin.light.sources import Source, weight_type
+from disco_twin.light.splitting import Window, new_stack, resume, weigh
 from disco_twin.light.tables import FAR, Cameras, Deposits, Images, Tables, cell_index, medium_at
 
 INNER = 8  # collisions per outer step
@@ -181,9 +183,47 @@ def cross(
 
 
 @dr.syntax
+def fly(
+    t: Tables, photon: Photon, flight: Any, reservoir: Reservoir, cams: Cameras | None, images: Images | None,
+    deposits: Deposits | None, sums: Balance, rng: Rng,
+) -> Any:  # fmt: skip
+    """A flight that may meet the surface: up to it, to the collision at its end, or out of sight.
+
+    Returns (photon, reservoir, sums, rng).
+    """
+    wide = type(sums.inside)
+    photon.steps += 1
+    reach = dr.select(photon.inside, flight, FAR)
+    ray = mi.Ray3f(mi.Point3f(photon.p + photon.clear), photon.d, reach, 0.0, mi.Color0f())
+    si = t.scene.ray_intersect(ray, mi.RayFlags.Minimal, False, True)
+    photon.clear = mi.Vector3f(0.0)
+    # Measured from p itself: the lifted origin is nearer to the far wall, which matters in thin plates.
+    if dr.hint(si.is_valid() & (~photon.inside | (dr.dot(si.p - photon.p, photon.d) < flight))):
+        photon, sums, rng = cross(t, photon, si, cams, images, deposits, sums, rng)
+    else:
+        if dr.hint(photon.inside):
+            photon.p = mi.Point3f(dr.fma(photon.d, flight, photon.p))
+            photon.empty = dr.gather(mi.Float, t.distance, cell_index(t, photon.p))
+            leaked = dr.max(dr.abs(photon.p)) > t.bound  # only through a mesh that is not watertight
+            sums.inside += wide(dr.select(leaked, photon.w, 0.0))
+            photon.alive = ~leaked
+            if dr.hint(~leaked):
+                photon, reservoir, sums, rng = collide(t, photon, reservoir, sums, rng, cams is not None)
+        else:
+            sums.reflected += wide(dr.select(photon.entered, 0.0, photon.w))
+            sums.escaped += wide(dr.select(photon.entered, photon.w, 0.0))
+            photon.alive = mi.Bool(False)
+    cut = photon.alive & (photon.steps > MAX_STEPS)
+    sums.inside += wide(dr.select(cut, photon.w, 0.0))
+    photon.alive &= ~cut
+    return photon, reservoir, sums, rng
+
+
+@dr.syntax
 def walk(
     t: Tables, source: Source, cams: Cameras | None, images: Images | None, deposits: Deposits | None,
-    count: Any, per_tag: Any, first: Any, first_tag: Any, streams: Any, seed: Any, inverse_scale: Any, lanes: int,
+    count: Any, per_tag: Any, first: Any, first_tag: Any, streams: Any, seed: Any, inverse_scale: Any,
+    window: Window | None, lanes: int,
 ) -> Balance:  # fmt: skip
     """Walk `count` photons, `per_tag` of each tag, numbers `first`... of their tag's stream; returns the balance.
 
@@ -200,9 +240,12 @@ def walk(
     photon, reservoir = nobody(weight, lanes)
     flight = dr.zeros(mi.Float, lanes)
     running = dr.full(mi.Bool, True, lanes)
+    stack = new_stack(t.lasers, lanes) if window is not None else None
 
     while dr.hint(running, label="walk"):
-        # 1. A lane without a photon fetches the next one.
+        # 1. A lane without a photon takes a copy that waits, or fetches the next one.
+        if dr.hint(window is not None, mode="scalar"):
+            photon, stack = resume(t, stack, photon, running, weight)
         need = running & ~photon.alive
         if dr.hint(need):
             index = dr.scatter_inc(counter, mi.UInt32(0), need)
@@ -229,47 +272,17 @@ def walk(
                 photon.p, photon.empty, photon.clear = mi.Point3f(q), mi.Float(ball), mi.Vector3f(0.0)
                 photon, reservoir, sums, rng = collide(t, photon, reservoir, sums, rng, cams is not None)
 
-        # 3. One drawn collision connects to the cameras.
+        # 3. The surface, or a collision that the distance field could not vouch for.
+        if dr.hint(photon.alive & pending):
+            photon, reservoir, sums, rng = fly(t, photon, flight, reservoir, cams, images, deposits, sums, rng)
+
+        # 4. One drawn collision connects to the cameras, also of a photon that has just left.
         if dr.hint(cams is not None, mode="scalar"):
             if dr.hint(reservoir.seen > 0.0):
                 drawn = reservoir.weight * reservoir.seen
                 rng = connect_lobes(t, cams, images, photon.tag, reservoir.point, reservoir.before, drawn, rng)
                 reservoir.seen = mi.Float(0.0)
 
-        # 4. Russian roulette on the largest weight, towards 0.2 of a launched one.
-        strongest = dr.max(photon.w) * inverse_scale
-        if dr.hint(photon.alive & photon.inside & (strongest < 0.1)):
-            chance = strongest * 5.0
-            survives = rng.next() < chance
-            after = dr.select(survives, photon.w / chance, 0.0)
-            sums.roulette += wide(after - photon.w)
-            photon.w = after
-            photon.alive &= survives
-
-        # 5. The surface, or a collision that the distance field could not vouch for.
-        if dr.hint(photon.alive & pending):
-            photon.steps += 1
-            reach = dr.select(photon.inside, flight, FAR)
-            ray = mi.Ray3f(mi.Point3f(photon.p + photon.clear), photon.d, reach, 0.0, mi.Color0f())
-            si = t.scene.ray_intersect(ray, mi.RayFlags.Minimal, False, True)
-            photon.clear = mi.Vector3f(0.0)
-            # Measured from p itself: the lifted origin is nearer to the far wall, which matters in thin plates.
-            if dr.hint(si.is_valid() & (~photon.inside | (dr.dot(si.p - photon.p, photon.d) < flight))):
-                photon, sums, rng = cross(t, photon, si, cams, images, deposits, sums, rng)
-            else:
-                if dr.hint(photon.inside):
-                    photon.p = mi.Point3f(dr.fma(photon.d, flight, photon.p))
-                    photon.empty = dr.gather(mi.Float, t.distance, cell_index(t, photon.p))
-                    leaked = dr.max(dr.abs(photon.p)) > t.bound  # only through a mesh that is not watertight
-                    sums.inside += wide(dr.select(leaked, photon.w, 0.0))
-                    photon.alive = ~leaked
-                    if dr.hint(~leaked):
-                        photon, reservoir, sums, rng = collide(t, photon, reservoir, sums, rng, cams is not None)
-                else:
-                    sums.reflected += wide(dr.select(photon.entered, 0.0, photon.w))
-                    sums.escaped += wide(dr.select(photon.entered, photon.w, 0.0))
-                    photon.alive = mi.Bool(False)
-            cut = photon.alive & (photon.steps > MAX_STEPS)
-            sums.inside += wide(dr.select(cut, photon.w, 0.0))
-            photon.alive &= ~cut
+        # 5. The weight window: Russian roulette, splitting.
+        photon, stack, sums, rng = weigh(t, window, stack, photon, first_tag, inverse_scale, sums, rng)
     return sums

@@ -21,6 +21,7 @@ from twins import camera
 
 from disco_twin.light import sampling
 from disco_twin.light import transport as module
+from disco_twin.light.importance import Splitting
 from disco_twin.light.sampling import Rng
 from disco_twin.light.sources import BeamSource
 from disco_twin.light.transport import Traced, Transport
@@ -75,6 +76,24 @@ def assert_same(a: Traced, b: Traced, part: slice | int = slice(None)) -> None:
 def usual(request: pytest.FixtureRequest) -> tuple[Transport, Traced]:
     transport = pebble(request.param)
     return transport, trace(transport)
+
+
+@pytest.mark.parametrize("kind", ["rough", "matched"])
+def test_splitting(kind: str, monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
+    """With weight windows: one spot at a time in calls of a few photons, other lanes and threads, another company."""
+    transport = pebble(kind)
+    entries = -4.5 * AXES
+
+    def split(which: Sequence[int] = range(SPOTS)) -> Splitting:
+        return Splitting(entries[list(which)], 3.0)
+
+    expected = trace(transport, split=split())
+    assert_same(expected, trace(transport, split=split(), lanes=1000))
+    dr.set_thread_count(1)
+    assert_same(expected, trace(transport, [3, 1], split=split([3, 1])), [3, 1])  # type: ignore[arg-type]
+    monkeypatch.setattr(module, "ACCUMULATOR_BYTES", 1)
+    monkeypatch.setattr(module, "PHOTONS_PER_CALL", 700)
+    assert_same(expected, trace(transport, split=split()))
 
 
 def test_batches(usual: tuple[Transport, Traced], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,145 @@
+"""Weight windows change noise and time, never the mean; what they are made from solves the diffusion equation."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+from significance import assert_z, z_of_difference, z_of_replicates
+from test_estimators import SPOT, VIEWS, blocks, bumpy
+from test_known_answers import HALF_SPACE, half_space
+from twins import beam, block, camera, escaped, twin
+
+from disco_twin.light.importance import STEEPEST, Splitting, diffusion, window_targets
+from disco_twin.light.sources import opaque3, to_float
+from disco_twin.light.splitting import Window
+from disco_twin.light.transport import Transport
+
+F64 = NDArray[np.float64]
+REPLICATES = 32
+ENTRY = np.tile(np.array(SPOT["origin"]) + 41.0 * np.array(SPOT["direction"]), (REPLICATES, 1))
+
+
+@pytest.mark.parametrize(("kind", "g"), [("rough", 0.0), ("rough", 0.8), ("matched", 0.4)])
+def test_splitting_is_unbiased(kind: str, g: float) -> None:
+    """Rationale: a copy that forgets part of its photon's state (flight, last collision, power) moves energy.
+
+    Expected behaviour: deposits at every vertex and images in every block of pixels equal those of the plain walk,
+    z-scores from 32 replicates each, and dark vertices are less noisy.
+    """
+    obj = bumpy(kind, g=g)
+    views = [camera(place, 13.0, 24) for place in VIEWS]
+    transport = Transport(obj, cells=64)
+    found = []
+    for split, walks in ((None, 12_000), (Splitting(ENTRY, 4.0), 3_000)):
+        key = {"seed": 81, "cameras": views, "layers": 2, "deposit": True, "split": split}
+        traced = transport.trace(beam(REPLICATES, **SPOT), REPLICATES, walks, **key)  # type: ignore[arg-type]
+        assert traced.images is not None
+        assert traced.deposits is not None
+        found.append((blocks(traced.images[:, 0, :, 0].astype(float), 6), traced.deposits[:, 0], walks))
+    (plain, there, many), (split_images, here, few) = found
+    lit = blocks((traced.images[:, 0, :, 0] > 0).mean(axis=0), 6) > 8
+    assert lit.sum() > 15
+    assert_z(z_of_difference(split_images[:, lit], plain[:, lit]), f"{kind}, g = {g}: blocks")
+    order = np.argsort(-np.linalg.norm(transport.vertices - ENTRY[0], axis=1))  # not by what was found: that selects
+    groups = np.array_split(order, 40)  # from far, dark to near
+    grouped = [np.stack([d[:, i].sum(axis=1) for i in groups], axis=1) for d in (here, there)]
+    assert_z(z_of_difference(*grouped), f"{kind}, g = {g}: deposits")
+    dark = groups[0]
+    assert here[:, dark].var(axis=0).sum() * few < 0.25 * there[:, dark].var(axis=0).sum() * many
+
+
+def test_any_map_is_unbiased() -> None:
+    """Rationale: the windows' targets must not matter for the mean, whatever they are.
+
+    Expected behaviour: with targets drawn at random over three decades, cell by cell, the exact reflectance of a
+    half-space, and launched power is accounted for.
+    """
+    transport = Transport(half_space(1.3, (0.9, 0.99, 0.999)))
+    cells = 24
+    targets = 10 ** np.random.default_rng(3).uniform(-2, 0.7, cells**3)
+    low, high = np.array([-4.0, -4.0, -6.0]), np.array([4.0, 4.0, 2.0])
+
+    def window(*_: object) -> Window:
+        return Window(
+            target=to_float(targets),
+            maps=dr.zeros(mi.UInt32, REPLICATES),
+            cells=cells,
+            low=opaque3(mi.Point3f, low),
+            inverse_cell=dr.opaque(mi.Float, cells / float((high - low)[0])),
+        )
+
+    transport._window = window  # type: ignore[method-assign]
+    make = beam(REPLICATES)
+    traced = transport.trace(make, REPLICATES, 4_000, seed=82, deposit=True, split=Splitting(np.zeros((REPLICATES, 3))))
+    assert traced.deposits is not None
+    assert_z(z_of_replicates(traced.deposits.sum(axis=2), HALF_SPACE[1.3][:3]))
+    assert np.abs(traced.balance.residual).max() < 1e-5
+
+
+def test_half_space_with_windows() -> None:
+    """The known reflectances, with the windows that are used."""
+    transport = Transport(half_space(1.5, (0.9, 0.99, 0.999)))
+    split = Splitting(np.tile([0.37, -0.21, 0.0], (REPLICATES, 1)))
+    traced = transport.trace(beam(REPLICATES), REPLICATES, 4_000, seed=83, deposit=True, split=split)
+    assert traced.deposits is not None
+    assert_z(z_of_replicates(traced.deposits.sum(axis=2), HALF_SPACE[1.5][:3]))
+
+
+def test_fluence_solves_the_diffusion_equation() -> None:
+    """Rationale: the estimate must fall with distance and absorption as light does, or windows waste time.
+
+    Expected behaviour: far inside a large box the fluence of a point source is exp(-k r) / (4 pi D r), within 12 % on
+    cells of half a decay length (finite volumes, three to seven cells from the source); a source's fluence at another
+    place is the other's at the first (reciprocity), exactly.
+    """
+    sigma_t, albedo = 1.0, 0.98
+    obj = twin(block(60.0, 60.0), "matched", 1.0, sigma_t, [albedo])
+    d, k = 1 / (3 * sigma_t), math.sqrt(3 * (1 - albedo))
+    estimate = diffusion(obj, 0, cells=30)
+    middle = estimate.low + (np.array([16, 16, 16]) + 0.5) * estimate.cell
+    fluence = estimate.fluence(middle[None])[0]
+    for steps in (3, 5, 7):
+        r = steps * estimate.cell
+        exact = math.exp(-k * r) / (4 * math.pi * d * r)
+        assert fluence[16, 16, 16 + steps] == pytest.approx(exact, rel=0.12), steps
+    other = estimate.low + (np.array([20, 10, 5]) + 0.5) * estimate.cell
+    assert estimate.fluence(other[None])[0][16, 16, 16] == pytest.approx(fluence[5, 10, 20], rel=1e-9)
+
+
+def test_targets_spend_the_effort() -> None:
+    """Expected: sum of max(fluence, f) = effort * sum of fluence over the filled cells, targets = min(1, fluence / f);
+    an effort that is out of reach evens everything out; no cell is far below its neighbours.
+    """
+    random = np.random.default_rng(7)
+    fluence = 10 ** random.uniform(-6, 0, (2, 9, 9, 9))
+    fluence[:] = np.sort(fluence.reshape(2, -1), axis=1).reshape(fluence.shape)  # smooth enough along x
+    filled = np.ones((9, 9, 9), bool)
+    for effort in (1.0, 1.5, 4.0):
+        targets = window_targets(fluence, filled, effort)
+        for values, target in zip(fluence, targets, strict=True):
+            level = (values / target)[target < 1].max() if (target < 1).any() else values.min()
+            met = np.maximum(values, level).sum() / values.sum()
+            assert met == pytest.approx(effort, rel=0.2)  # targets come in steps of a quarter octave
+    assert window_targets(fluence, filled, 1e9)[0].min() < 1e-4
+    hole = np.ones((1, 9, 9, 9))
+    hole[0, 4, 4, 4] = 1e-12
+    assert window_targets(hole, filled, 1e3).min() == pytest.approx(1 / STEEPEST)
+
+
+def test_a_thin_plate_has_windows_too() -> None:
+    """An object thinner than the diffusion's cells: the estimate is poor, the walk right."""
+    mesh = trimesh.creation.box(extents=[20.0, 20.0, 0.2])
+    obj = twin(mesh, "matched", 1.0, 2.0, [0.9])
+    transport = Transport(obj)
+    plain, _ = escaped(transport, beam(REPLICATES, origin=(0.3, 0.2, 5.0)), REPLICATES, 4_000, seed=84)
+    split = Splitting(np.tile([0.3, 0.2, 0.1], (REPLICATES, 1)))
+    make = beam(REPLICATES, origin=(0.3, 0.2, 5.0))
+    traced = transport.trace(make, REPLICATES, 4_000, seed=85, deposit=True, split=split)
+    assert traced.deposits is not None
+    assert_z(z_of_difference(traced.deposits.sum(axis=2), plain), "plate")
