@@ -34,7 +34,7 @@ from disco_twin.firmware.serve import Server
 from disco_twin.rig_commands import emulated_devices, rig_file_of
 from disco_twin.rig_file import load_rig_file
 from hw.clock import WallClock
-from hw.devices.omicron import Mode
+from hw.devices.omicron_protocol import Mode
 from hw.interface import Aim
 from hw.record import RawImage
 from hw.rig import SerialRig

@@ -37,6 +37,29 @@ class Framer(Protocol[M]):
         """Forget an unfinished message."""
 
 
+class LineFramer:
+    """Lines without CR and LF; NULs are dropped."""
+
+    def __init__(self) -> None:
+        self._line = bytearray()
+
+    def reset(self) -> None:
+        """Forget an unfinished line."""
+        self._line.clear()
+
+    def feed(self, data: bytes) -> list[str]:
+        """The lines that end in these bytes."""
+        lines = []
+        for byte in data:
+            if byte in b"\r\n":
+                if self._line:
+                    lines.append(self._line.decode("latin-1"))
+                self._line.clear()
+            elif byte:
+                self._line.append(byte)
+        return lines
+
+
 class Link:
     """An open port. `device` is what the rig calls the device, and begins every error."""
 

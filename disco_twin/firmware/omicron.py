@@ -213,10 +213,8 @@ def _recall_mode(head: LaserHead, arguments: str, now: float) -> str:
 def _autostart(head: LaserHead, arguments: str, now: float) -> str:
     if not arguments:
         return str(int(bool(head.mode & Mode.AUTOSTART)))
-    bit = int(Mode.AUTOSTART) if {"0": False, "1": True}.get(arguments) else 0
-    if arguments not in ("0", "1"):
-        return "x"
-    return _set_mode(head, f"{head.mode & ~Mode.AUTOSTART | bit:04X}", now)
+    bit = {"0": 0, "1": int(Mode.AUTOSTART)}.get(arguments)
+    return "x" if bit is None else _set_mode(head, f"{head.mode & ~Mode.AUTOSTART | bit:04X}", now)
 
 
 COMMANDS: dict[str, Command] = {

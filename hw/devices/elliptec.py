@@ -14,7 +14,7 @@ import numpy as np
 
 from hw.devices.turning import POLL_S, degrees_of, not_reached
 from hw.errors import DeviceFault, Garbled, NoAnswer, WrongDevice
-from hw.serial_link import Inbox, Link, persist
+from hw.serial_link import Inbox, LineFramer, Link, persist
 
 T = TypeVar("T")
 
@@ -43,29 +43,6 @@ CODES = {
 }
 
 
-class ElliptecFramer:
-    """Lines without CR and LF; NULs are dropped."""
-
-    def __init__(self) -> None:
-        self._line = bytearray()
-
-    def reset(self) -> None:
-        """Forget an unfinished line."""
-        self._line.clear()
-
-    def feed(self, data: bytes) -> list[str]:
-        """The lines that end in these bytes."""
-        lines = []
-        for byte in data:
-            if byte in b"\r\n":
-                if self._line:
-                    lines.append(self._line.decode("latin-1"))
-                self._line.clear()
-            elif byte:
-                self._line.append(byte)
-        return lines
-
-
 class ElliptecTable:
     """A rotary stage on a bus of up to 16; `address` is 0 unless it was changed."""
 
@@ -73,7 +50,7 @@ class ElliptecTable:
         self.link, self.reach_s = link, reach_s
         self._address = f"{address:X}"
         self._owed = False  # an answer that was not waited for may still come
-        self._inbox: Inbox[str] = Inbox(link, ElliptecFramer())
+        self._inbox: Inbox[str] = Inbox(link, LineFramer())
         self.model, self.serial_number, self._pulses = self._identify()
 
     # ---- talking

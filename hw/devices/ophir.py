@@ -11,9 +11,8 @@ import re
 from collections.abc import Callable
 from typing import TypeVar
 
-from hw.devices.elliptec import ElliptecFramer as LineFramer
 from hw.errors import DeviceFault, DeviceRefused, Garbled, NoAnswer, WrongDevice
-from hw.serial_link import Inbox, Link, persist
+from hw.serial_link import Inbox, LineFramer, Link, persist
 
 T = TypeVar("T")
 
@@ -46,6 +45,7 @@ class OphirMeter:
         if line is None:
             problem = f"did not answer ${command} within {ANSWER_S:g} s"
             raise NoAnswer(self.link.url, self.link.device, problem, "check cable, power and baud rate of the meter")
+        # a power after `?` is a garbled `*`, not a refusal
         if line.startswith("?") and not POWER.fullmatch(line[1:].strip()):
             problem = f"refused ${command} ({line[1:].strip()})"
             raise DeviceRefused(self.link.url, self.link.device, problem, "check that a sensor head is plugged in")

@@ -14,13 +14,12 @@ from serial_fakes import BoardBench, Bus, LaserBench, TableBench
 from disco_twin.firmware.wire import lost
 from hw.bytelog import HEADER, ByteLog, Event, ReplayPeer, read_log
 from hw.clock import VirtualClock
-from hw.devices.elliptec import ElliptecFramer
 from hw.devices.omicron import OmicronLaser
 from hw.devices.omicron_protocol import OmicronFramer
 from hw.devices.zaber import ZaberFramer, checksum, parse
 from hw.errors import DiscoError, InputError, Unplugged
 from hw.ports.protocol_memory import attach
-from hw.serial_link import Framer, Inbox, Link
+from hw.serial_link import Framer, Inbox, LineFramer, Link
 
 # ---- ports and time limits
 
@@ -81,7 +80,7 @@ def in_pieces(framer: Framer[object], data: bytes, sizes: list[int]) -> list[obj
     ("make", "frame", "unframe"),
     [
         (OmicronFramer, lambda w: f"!{w}\r".encode(), lambda m: m[1:]),
-        (ElliptecFramer, lambda w: f"{w}\r\n".encode(), lambda m: m),
+        (LineFramer, lambda w: f"{w}\r\n".encode(), lambda m: m),
         (ZaberFramer, lambda w: f"@01 1 07 OK IDLE -- {w}\r\n".encode(), lambda m: m.data),
     ],
 )
@@ -119,7 +118,7 @@ def test_garbage_before_an_answer_does_not_hide_it(garbage: bytes, word: str, si
 
 @given(st.binary(max_size=200), PIECES)
 def test_no_framer_ever_raises(noise: bytes, sizes: list[int]) -> None:
-    for framer in (OmicronFramer(), ZaberFramer(), ElliptecFramer()):
+    for framer in (OmicronFramer(), ZaberFramer(), LineFramer()):
         in_pieces(framer, noise, sizes)  # type: ignore[arg-type]
 
 
