@@ -19,6 +19,7 @@ from typing import Any
 from pipeline.resources import measured, usable_cores
 
 REGISTRY = {
+    "calibrate": "benchmarks.calibrate",
     "faults": "benchmarks.faults",
     "irradiance": "benchmarks.irradiance",
     "laser-safety": "benchmarks.laser_safety",

@@ -26,6 +26,12 @@ RunOut = Annotated[Path, typer.Option("--out", metavar="DIR", help="The run fold
 ProfileOption = Annotated[
     Literal["full", "small"], typer.Option(help="`small` shrinks the scene: fewer spots, pixels and walks.")
 ]
+FaultsOption = Annotated[
+    bool, typer.Option("--faults", help="All rig faults of 2004 on; the pipeline calibrates from the rig's own images.")
+]
+BudgetOption = Annotated[
+    bool, typer.Option("--budget", help="Reconstruct with parts of the calibration made true: what does each cost?")
+]
 MethodsOption = Annotated[
     str | None, typer.Option(help="`all`, or a list such as default,disco2004; left out: the scene's.")
 ]
@@ -33,12 +39,18 @@ app.add_typer(rig_app, name="rig")
 
 
 @app.command()
-def run(scene: SceneFile, out: RunOut, profile: ProfileOption = "full", methods: MethodsOption = None) -> None:
+def run(
+    scene: SceneFile,
+    out: RunOut,
+    profile: ProfileOption = "full",
+    methods: MethodsOption = None,
+    faults: FaultsOption = False,
+) -> None:
     """Capture, reconstruct, relight and score; writes summary.json and report.html. The same command resumes."""
     from disco_twin.run import open_run, print_scores, run_all
 
     with naming(scene):
-        opened = open_run(scene, out, profile, methods, console)
+        opened = open_run(scene, out, profile, methods, console, faults)
         console.print(f"[bold]{opened.scene.name}[/bold] into {out}", highlight=False)
         summary = run_all(opened)
     print_scores(summary, opened.methods, console)
@@ -50,6 +62,7 @@ def capture(
     scene: SceneFile,
     out: RunOut,
     profile: ProfileOption = "full",
+    faults: FaultsOption = False,
     rig: Annotated[
         Path | None, typer.Option(metavar="RIG.TOML", help="Capture with the devices of a rig file, not with the twin.")
     ] = None,
@@ -62,7 +75,7 @@ def capture(
     from disco_twin.run import capture_stages, open_run
 
     with naming(scene):
-        opened = open_run(scene, out, profile, None, console)
+        opened = open_run(scene, out, profile, None, console, faults)
         with run_log(opened.folder.root / "run.log", console):
             if rig is None:
                 capture_stages(opened)
@@ -132,14 +145,18 @@ def reference(scene: SceneFile, out: RunOut, profile: ProfileOption = "full") ->
 
 
 @app.command()
-def score(out: RunOut, methods: MethodsOption = None) -> None:
+def score(out: RunOut, methods: MethodsOption = None, budget: BudgetOption = False) -> None:
     """Score a finished run again and write its summary and report. Needs no renderer."""
     from disco_twin.console import run_log
-    from disco_twin.run import print_scores, reopen_run, score_stages
+    from disco_twin.run import print_budget, print_scores, reopen_run, score_stages
 
     opened = reopen_run(out, methods, console)
     with naming(opened.scene_file), run_log(opened.folder.root / "run.log", console):
         print_scores(score_stages(opened), opened.methods, console)
+        if budget:
+            from disco_twin.budget import score_budget
+
+            print_budget(score_budget(opened.world, opened.folder, opened.methods[0]), console)
 
 
 @app.command()

@@ -36,6 +36,7 @@ class Stream(IntEnum):
     DEVIATION = 5
     MIRRORS = 6
     TARGETS = 7
+    SCANNER = 8
 
 
 def generator(seed: int, stream: Stream, *address: int) -> Generator:

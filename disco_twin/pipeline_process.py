@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from disco_twin.folder import RunFolder, write_atomically
@@ -32,15 +33,18 @@ def pipeline_inputs(scene: Scene, methods: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def reconstruct_apart(scene: Scene, folder: RunFolder, methods: Sequence[str]) -> float:
+def reconstruct_apart(
+    scene: Scene, folder: RunFolder, methods: Sequence[str], calibration: Path | None = None
+) -> float:
     """Run `python -m pipeline` on the capture; its peak memory in MiB. Its messages go to OUT/work/pipeline.log.
 
+    calibration: a file to use instead of what the pipeline would calibrate itself.
     The peak is the process's own word: `wait4` would count what our process held when it started the child.
     """
     request = folder.work / REQUEST
     write_atomically(request, json.dumps(pipeline_inputs(scene, methods), indent=1).encode())
     command = [sys.executable, "-m", "pipeline", str(folder.capture), str(folder.work), "--request", str(request)]
-    command.append("--until-stdin-closes")
+    command += ["--until-stdin-closes", *(() if calibration is None else ("--calibration", str(calibration)))]
     with tempfile.TemporaryFile("w+") as errors:
         with (
             (folder.work / "pipeline.log").open("w") as log,

@@ -29,6 +29,7 @@ METHODS: tuple[str, ...] = get_args(Method)
 BASELINES = ("dipole", "lambertian")
 OUTPUTS = {  # files that a finished stage leaves, as patterns in the run folder
     "scan": ("capture/scan.ply", "capture/rig.json", "capture/sensor.json"),
+    "targets": ("capture/calibration/*/*",),
     "capture": ("capture/images.bin", "capture/journal.bin", "capture/plan.json"),
     "truth": ("twin/truth.npz",),
     "references": ("twin/references/*.exr",),
@@ -72,9 +73,11 @@ class Run:
         self.console.print(f"  {name:<12} {note}", highlight=False)
 
 
-def open_run(scene_file: Path, out: Path, profile: Profile, methods: str | None, console: Console) -> Run:
+def open_run(
+    scene_file: Path, out: Path, profile: Profile, methods: str | None, console: Console, faults: bool = False
+) -> Run:
     """Read the scene and claim the folder for it."""
-    scene = load_scene(scene_file, profile)
+    scene = load_scene(scene_file, profile, faults)
     chosen = choose_methods(methods, scene)
     folder = RunFolder.claim(out, scene_file, identity(scene))
     write_atomically(folder.root / SCENE_RECORD, scene.model_dump_json(indent=1).encode())
@@ -115,6 +118,7 @@ def drop_old_light(folder: RunFolder, key: str) -> None:
     if marker.is_file() and marker.read_text() == key:
         return
     old = [] if folder.taken_by_devices else [folder.capture / name for name in (IMAGES, JOURNAL, PLAN)]
+    old += [] if folder.taken_by_devices else [*folder.capture.glob("calibration/*/*")]
     old += [*folder.twin.glob("responses/spots-*.npy"), *folder.twin.glob("references/*.exr")]
     old = [path for path in old if path.is_file()]
     if old:
@@ -136,6 +140,13 @@ def capture_stages(run: Run) -> None:
     drop_old_light(run.folder, key)
     scan_key = content_key(key, run.scene.relight.model_dump_json(include={"views"}))
     run.stage("scan", scan_key, lambda _: simulate.write_scan(run.world, run.folder.capture))
+    if run.scene.rig.faults.deviation:  # a rig that stands as its configuration says needs no calibration
+        run.stage(
+            "targets",
+            content_key(key, source_key("pipeline.capture.targets")),
+            lambda report: simulate.take_targets(run.world, run.folder, report),
+            "images",
+        )
     run.stage("capture", key, lambda report: simulate.take_images(run.world, run.folder, report), "images")
 
 
@@ -238,5 +249,24 @@ def print_scores(summary: dict[str, Any], methods: Sequence[str], console: Conso
         table.add_column(method, justify="right")
     for light in dict.fromkeys(r["light"] for r in relit):
         table.add_row(light, *(figure_or_dash(pooled(relit, method, light)) for method in methods))
+    console.print()
+    console.print(table)
+
+
+def print_budget(rows: Sequence[dict[str, Any]], console: Console) -> None:
+    """A table of nrmse by light and calibration."""
+    from rich.table import Table
+
+    from disco_twin.report import figure_or_dash, rms
+
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    table.add_column("nrmse, calibration")
+    lights = list(dict.fromkeys(row["light"] for row in rows))
+    for light in lights:
+        table.add_column(light, justify="right")
+    for name in dict.fromkeys(row["calibration"] for row in rows):
+        own = [row for row in rows if row["calibration"] == name]
+        kept = {x: [r["nrmse"] for r in own if r["light"] == x and r["nrmse"] is not None] for x in lights}
+        table.add_row(name, *(figure_or_dash(rms(kept[x]) if kept[x] else None) for x in lights))
     console.print()
     console.print(table)

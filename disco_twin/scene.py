@@ -11,7 +11,7 @@ from disco_twin.object.schema import ObjectConfig
 from pipeline.config import Strict, load_toml
 from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.relight.lights import Colour, Light, shipped_lights
-from pipeline.rig import CameraConfig, RigConfig
+from pipeline.rig import CameraConfig, FaultsConfig, RigConfig
 
 Count = Annotated[int, Field(ge=1, le=10**10)]
 Profile = Literal["full", "small"]
@@ -101,9 +101,15 @@ def _colours(light: Light) -> list[Colour]:
     return [light.constant, *(lobe.radiance for lobe in light.lobes)] if light.kind == "environment" else [light.colour]
 
 
-def load_scene(path: str | Path, profile: Profile = "full") -> Scene:
-    """Read a scene; file names inside it are relative to its folder. `small` shrinks it, see `shrink`."""
+def load_scene(path: str | Path, profile: Profile = "full", faults: bool = False) -> Scene:
+    """Read a scene; file names inside it are relative to its folder. `small` shrinks it, see `shrink`.
+
+    faults: every fault of the rig is on, whatever the scene says
+    """
     scene = load_toml(path, Scene)
+    if faults:
+        on = FaultsConfig(**dict.fromkeys(FaultsConfig.model_fields, True))
+        scene = scene.model_copy(update={"rig": scene.rig.model_copy(update={"faults": on})})
     return shrink(scene) if profile == "small" else scene
 
 

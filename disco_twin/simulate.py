@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,6 +62,32 @@ def _require_equal_sizes(cameras: Sequence[CameraConfig], key: str) -> None:
     if len(sizes) > 1:
         remedy = "give all of them one width and height"
         raise InputError("the twin's cameras must have one image size", key=key, value=sorted(sizes), remedy=remedy)
+
+
+def _later(progress: Progress, before: int, total: int, done: int, _: int) -> None:
+    """One of several captures as a part of the whole."""
+    progress(before + done, total)
+
+
+def take_targets(world: World, folder: RunFolder, progress: Progress) -> None:
+    """The calibration images, camera by camera, into the capture's folder; continues where it was interrupted."""
+    from disco_twin.camera.targets import TargetSource
+    from disco_twin.deviation import actual_rig
+    from disco_twin.rig import TargetRig
+    from pipeline.capture.loop import capture
+    from pipeline.capture.targets import FOLDER, TARGETS, make_targets
+
+    rig, seed = world.scene.rig, world.scene.seed
+    actual, made = actual_rig(rig, seed), [make_targets(rig, c) for c in range(len(rig.cameras))]
+    total, before = sum(len(plan) for _, plan in made), 0
+    for c, (targets, plan) in enumerate(made):
+        own = folder.capture / FOLDER / targets.camera
+        own.mkdir(parents=True, exist_ok=True)
+        source = TargetSource(targets, actual.cameras[c], actual, rig.projector.beam_diameter_mm / 2)
+        twin = TargetRig(rig, source, seed, actual, c, len(targets.placements))
+        capture(twin, plan, own, partial(_later, progress, before, total))
+        write_atomically(own / TARGETS, targets.model_dump_json(indent=1).encode())
+        before += len(plan)
 
 
 def twin_rig(world: World, folder: RunFolder) -> TwinRig:

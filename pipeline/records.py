@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict
+from pydantic import ConfigDict, Field
 
 from hw.record import Sensor
 from pipeline.config import Strict, as_table
@@ -53,5 +53,6 @@ class PipelineRecord(Figures):
     stages: tuple[StageFigures, ...]
     methods: dict[str, MethodFigures]
     capture: dict[str, Any]
+    calibration: dict[str, Any] = Field(default_factory=dict)  # what its measurement found; empty where it is nominal
     left_out: tuple[dict[str, str], ...]
     warnings: tuple[str, ...]

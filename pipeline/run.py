@@ -28,9 +28,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from hw.errors import DiscoError, InputError, refused_by_the_disk
+from hw.record import Sensor
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
 from pipeline.calibrate.camera import PinholeCamera
 from pipeline.calibrate.fresnel import Boundary
+from pipeline.calibrate.measure import has_targets, measure
 from pipeline.capture.stream import StreamReader
 from pipeline.config import Strict, read_json
 from pipeline.reconstruct.methods import METHODS, READINGS, reconstruct
@@ -44,7 +46,7 @@ from pipeline.relight.irradiance import transmitted_flux
 from pipeline.relight.lights import Light
 from pipeline.relight.relight import ViewMatrix, view_matrix
 from pipeline.resources import measured
-from pipeline.rig import CameraConfig
+from pipeline.rig import CameraConfig, RigConfig
 
 FORMAT_VERSION = 1
 CAPTURE_AGAIN = "delete it, then repeat the capture command"
@@ -165,15 +167,17 @@ def prepare(
     return fluxes, {v.name: view_matrix(mesh, PinholeCamera.from_config(v), boundary) for v in wanted.views}
 
 
-def run(capture: Path, work: Path, request: Request) -> dict[str, Any]:
-    """Everything; returns what pipeline.json holds."""
+def run(capture: Path, work: Path, request: Request, given: Path | None = None) -> dict[str, Any]:
+    """Everything; returns what pipeline.json holds. given: a calibration file from before, instead of a new one."""
     stages, settings = Stages(), request.reconstruct
     work.mkdir(parents=True, exist_ok=True)
     with stages.stage("calibration"):
         rig = read_json(capture / "rig.json", RigFile, CAPTURE_AGAIN).rig
         sensor = read_json(capture / "sensor.json", SensorFile, CAPTURE_AGAIN).sensor
         mesh = read_scan(capture / "scan.ply")
-        calibration = nominal_calibration(rig, sensor)
+        calibration, calibrated = (
+            calibrate(capture, rig, sensor, mesh) if given is None else (Calibration.load(given), {})
+        )
         calibration.save(work / "calibration.json")
     samples, statistics = gather(capture, calibration, mesh, settings, stages)
     if statistics.coverage == 0:
@@ -199,11 +203,22 @@ def run(capture: Path, work: Path, request: Request) -> dict[str, Any]:
             for name in models
         },
         "capture": asdict(statistics),
+        "calibration": calibrated,
         "left_out": [item.row() for item in left_out],
-        "warnings": warnings_of(statistics),
+        "warnings": [*warnings_of(statistics), *(f"pose: {text}" for text in calibrated.get("ambiguity", ()))],
     }
     write_json(work / "pipeline.json", result)
     return result
+
+
+def calibrate(
+    capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh
+) -> tuple[Calibration, dict[str, Any]]:
+    """From the rig's own images where there are any, else nominal; and what the stages of a measurement found."""
+    if not has_targets(capture, rig):
+        return nominal_calibration(rig, sensor), {}
+    found = measure(capture, rig, sensor, mesh)
+    return found.calibration, found.report()
 
 
 def warnings_of(statistics: SampleStatistics) -> list[str]:
@@ -222,6 +237,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("capture", type=Path, help="folder with rig.json, sensor.json, scan.ply and the stream")
     parser.add_argument("work", type=Path, help="folder to write into")
     parser.add_argument("--request", type=Path, required=True, help="JSON: reconstruct, relight")
+    parser.add_argument("--calibration", type=Path, help="calibration.json of an earlier run; else calibrate")
     parser.add_argument("--until-stdin-closes", action="store_true", help="end at once when the starting process ends")
     options = parser.parse_args(arguments)
     if options.until_stdin_closes:
@@ -229,7 +245,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(levelname)s %(name)s: %(message)s")
     try:
         request = read_json(options.request, Request, "write it as docs/conventions.md says")
-        run(options.capture, options.work, request)
+        run(options.capture, options.work, request, options.calibration)
     except DiscoError as error:
         sys.stderr.write(f"{error}\n")
         return 2

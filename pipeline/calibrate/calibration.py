@@ -29,11 +29,18 @@ from pipeline.rig import RigConfig
 F64 = NDArray[np.float64]
 Row = tuple[float, float, float, float]
 Pose = tuple[Row, Row, Row, Row]
-Error = Annotated[float, Field(ge=0)] | None  # one standard deviation; None: not measured
+NotNegative = Annotated[float, Field(ge=0)]
+Error = NotNegative | None  # one standard deviation; None: not measured
+Errors3 = tuple[NotNegative, NotNegative, NotNegative] | None  # the same along x, y, z of the device's frame
+Errors2 = tuple[NotNegative, NotNegative] | None
 
 
 class ViewCalibration(Strict):
-    """One camera at one turntable angle. Lengths in pixels where named so; distortion is k1 k2 p1 p2 k3."""
+    """One camera at one turntable angle. Lengths in pixels where named so; distortion is k1 k2 p1 p2 k3.
+
+    A pose's errors are those of the object's rotation about its own origin and of that origin, along the camera's axes.
+    radiance_factor: per laser, what makes the camera's radiances agree with the photodiode; empty: 1 (not measured)
+    """
 
     camera: str
     angle_rad: float
@@ -44,8 +51,11 @@ class ViewCalibration(Strict):
     distortion: tuple[float, float, float, float, float]
     object_to_camera: Pose
     focal_error_px: Error = None
-    rotation_error_rad: Error = None
-    translation_error_mm: Error = None
+    centre_error_px: Errors2 = None
+    rotation_error_rad: Errors3 = None
+    translation_error_mm: Errors3 = None
+    radiance_factor: tuple[Annotated[float, Field(gt=0)], ...] = ()
+    radiance_factor_error: tuple[NotNegative, ...] = ()
 
 
 class ProjectorCalibration(Strict):
@@ -57,8 +67,9 @@ class ProjectorCalibration(Strict):
     separation_mm: float
     beam_diameter_mm: float
     object_to_projector: Pose
-    rotation_error_rad: Error = None
-    translation_error_mm: Error = None
+    rotation_error_rad: Errors3 = None
+    translation_error_mm: Errors3 = None
+    full_angle_error_rad: Errors2 = None
 
 
 class LaserCalibration(Strict):
@@ -125,8 +136,9 @@ class Calibration(Strict):
         return _illumination(v.width, v.height, v.focal_px, v.centre_px, v.distortion, self.vignetting_exponent)
 
     def radiance(self, raw: RawImage, view: int, laser: int) -> RadianceImage:
-        """(H, W) radiance in W/(mm^2 sr) with its variance, corrected for the lens's vignetting."""
-        image, gain = to_radiance(raw, self.sensor, laser), 1.0 / self.vignetting(view)
+        """(H, W) radiance in W/(mm^2 sr) with its variance, corrected for vignetting and white balance."""
+        factors = self.views[view].radiance_factor
+        image, gain = to_radiance(raw, self.sensor, laser), (factors[laser] if factors else 1.0) / self.vignetting(view)
         return replace(
             image,
             radiance=(image.radiance * gain).astype(np.float32),
@@ -169,13 +181,20 @@ def _illumination(
     return gain
 
 
-def _pose(matrix: F64) -> Pose:
+def pose_rows(matrix: F64) -> Pose:
+    """(4, 4) as the file's nested tuples."""
     rows: list[Row] = [(float(a), float(b), float(c), float(d)) for a, b, c, d in matrix]
     return rows[0], rows[1], rows[2], rows[3]
 
 
-def _pair(values: F64) -> tuple[float, float]:
+def pair(values: F64) -> tuple[float, float]:
+    """(2,) as the file's tuple."""
     return float(values[0]), float(values[1])
+
+
+def triple(values: F64) -> tuple[float, float, float]:
+    """(3,) as the file's tuple."""
+    return float(values[0]), float(values[1]), float(values[2])
 
 
 def nominal_calibration(rig: RigConfig, sensor: Sensor) -> Calibration:
@@ -191,10 +210,10 @@ def nominal_calibration(rig: RigConfig, sensor: Sensor) -> Calibration:
                     angle_rad=angle,
                     width=config.width,
                     height=config.height,
-                    focal_px=_pair(camera.focal),
-                    centre_px=_pair(camera.centre),
+                    focal_px=pair(camera.focal),
+                    centre_px=pair(camera.centre),
                     distortion=config.distortion,
-                    object_to_camera=_pose(camera.seen_from(turn(angle)).pose),
+                    object_to_camera=pose_rows(camera.seen_from(turn(angle)).pose),
                 )
             )
     projector = TwoMirrorProjector.from_config(rig.projector)
@@ -202,10 +221,10 @@ def nominal_calibration(rig: RigConfig, sensor: Sensor) -> Calibration:
         ProjectorCalibration(
             angle_rad=angle,
             steps=projector.steps,
-            full_angle_rad=_pair(projector.full_angle_rad),
+            full_angle_rad=pair(projector.full_angle_rad),
             separation_mm=projector.separation_mm,
             beam_diameter_mm=rig.projector.beam_diameter_mm,
-            object_to_projector=_pose(projector.seen_from(turn(angle)).pose),
+            object_to_projector=pose_rows(projector.seen_from(turn(angle)).pose),
         )
         for angle in angles
     )

@@ -1,8 +1,8 @@
 """Where the object stands before each camera, from silhouettes (thesis 5.2.2), all views of a sweep together.
 
-Unknown are each camera's pose at the first turntable angle, the turntable's axis, the angles' small errors and, within
-what the boards left open, each camera's lens. A coarse stage walks down the distance to the photographed silhouette
-from centimetres and ten degrees away, a fine one fits edges to a few hundredths of a pixel.
+Unknown are each camera's pose at the first turntable angle, the turntable's axis and the angles' small errors; what the
+boards left open of each camera's lens is carried into the poses' uncertainty. A coarse stage walks down the distance to
+the photographed silhouette from centimetres and ten degrees away, a fine one fits edges to a few hundredths of a pixel.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from pipeline.calibrate.camera import PinholeCamera, turn
@@ -29,8 +30,12 @@ UNDETERMINED_RAD, UNDETERMINED_MM = np.deg2rad(1.0), 5.0  # a direction that is 
 COARSE_STEPS, FINE_STEPS, EXACT_STEPS = 25, 5, 2
 HUBER_COARSE_PX, HUBER_FINE_PX = 3.0, 0.15
 SECTORS = 24  # per view: errors of the edges within one are taken as dependent
-COMMON_EDGE_PX = 0.003  # by which all edges of a camera may be off together
+COMMON_EDGE_PX, PATCHES = (
+    0.003,
+    8,
+)  # edges of a camera may be off together: by this, and as much as that many patches are
 LENS = 4  # focal, centre x, y, k1
+HELD = 1e-7  # pixels: a lens does not follow the silhouettes
 
 
 @dataclass(frozen=True)
@@ -96,12 +101,18 @@ class _Sweep:
     def jacobian(self, view: int, rim: Outline) -> F64:
         """(K, P) pixels by which the outline moves along its normals, by the increments; central differences.
 
-        A pose moves a smooth outline only as far as it moves the surface along its own normal.
+        A pose moves a smooth outline only as far as it moves the surface along its own normal, which at a rim is square
+        to the line of sight. A mesh's normal is so only nearly: for shifts, which it would spoil, it is made so; for
+        rotations it is left, lest facets tell how far a round object has turned.
         """
         base, columns = np.zeros(self.size), []
         camera, here = view // len(self.angles), self.view(view)
         depth = rim.points @ here.pose[2, :3] + here.pose[2, 3]
         scale = here.focal.mean() / (depth * np.linalg.norm(rim.across[:, :2], axis=1))
+        sight = rim.points @ here.pose[:3, :3].T + here.pose[:3, 3]
+        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+        level = rim.across - (rim.across * sight).sum(axis=1, keepdims=True) * sight
+        level /= np.linalg.norm(level, axis=1, keepdims=True)
         for k in range(self.size):
             lens = k < (6 + LENS) * len(self.lenses)
             if lens and k // (6 + LENS) != camera:
@@ -116,17 +127,26 @@ class _Sweep:
                 columns.append(moved.sum(axis=1) / (2 * h))
             else:
                 change = (ahead.pose - behind.pose) / (2 * h)
-                columns.append(scale * ((rim.points @ change[:3, :3].T + change[:3, 3]) * rim.across).sum(axis=1))
+                turned = ((rim.points @ change[:3, :3].T) * rim.across).sum(axis=1)
+                columns.append(scale * (turned + level @ change[:3, 3]))
         return np.stack(columns, axis=1)
 
 
-def _priors(sweep: _Sweep, lens_covariance: Sequence[F64]) -> F64:
-    """(P, P) precision of the increments about the starting values."""
+def _lens_rows(sweep: _Sweep) -> NDArray[np.bool_]:
+    """(P,) which increments are of lenses. The boards know these better than any silhouette: they stay as they are."""
+    rows = np.zeros(sweep.size, bool)
+    for c in range(len(sweep.lenses)):
+        rows[(6 + LENS) * c + 6 : (6 + LENS) * (c + 1)] = True
+    return rows
+
+
+def _priors(sweep: _Sweep) -> F64:
+    """(P, P) precision of the increments about the starting values; lenses are held."""
     precision = np.zeros((sweep.size, sweep.size))
-    for c, covariance in enumerate(lens_covariance):
+    for c in range(len(sweep.lenses)):
         at = (6 + LENS) * c
-        precision[at : at + 6, at : at + 6] = np.diag([PLACE_RAD**-2] * 3 + [PLACE_MM**-2] * 3)
-        precision[at + 6 : at + 10, at + 6 : at + 10] = np.linalg.inv(covariance + np.diag([1e-6, 1e-8, 1e-8, 1e-12]))
+        sigma = np.array([PLACE_RAD] * 3 + [PLACE_MM] * 3 + [HELD] * LENS)
+        precision[at : at + 6 + LENS, at : at + 6 + LENS] = np.diag(sigma**-2)
     rest = sweep.size - (6 + LENS) * len(sweep.lenses)
     if rest:
         sigma = np.array([AXIS_RAD] * 2 + [AXIS_MM] * 2 + [ANGLE_RAD] * (rest - 4))
@@ -151,14 +171,13 @@ def fit_poses(
     relative = np.asarray(angles, float) - angles[0]
     start = _Sweep(list(cameras), relative, errors=np.zeros(len(relative) - 1))
     masks = [object_mask(image) for image in images]
-    sweep = _coarse(start, masks, mesh, covariance)
-    return _fine(sweep, start, images, masks, mesh, covariance)
+    return _fine(_coarse(start, masks, mesh), images, masks, mesh, covariance)
 
 
-def _coarse(start: _Sweep, masks: Sequence[NDArray[np.bool_]], mesh: trimesh.Trimesh, lens: Sequence[F64]) -> _Sweep:
+def _coarse(start: _Sweep, masks: Sequence[NDArray[np.bool_]], mesh: trimesh.Trimesh) -> _Sweep:
     """Down the distance to the silhouettes, from several starts that differ by a few degrees; the best by XOR."""
     distances = [signed_distance(m) for m in masks]
-    precision = _priors(start, lens)
+    precision = _priors(start)
     best, fewest = start, np.inf
     for tilt in _STARTS:
         sweep = start
@@ -166,7 +185,7 @@ def _coarse(start: _Sweep, masks: Sequence[NDArray[np.bool_]], mesh: trimesh.Tri
             step = np.zeros(start.size)
             step[(6 + LENS) * c : (6 + LENS) * c + 3] = tilt
             sweep = _centred(sweep.moved(step), c, masks[c * len(start.angles)], mesh, camera)
-        total: F64 = np.zeros(start.size)
+        total = np.asarray(np.zeros(start.size))
         for _ in range(COARSE_STEPS):
             hessian, gradient = precision * 1e-2, -1e-2 * precision @ total
             for v, distance in enumerate(distances):
@@ -178,9 +197,10 @@ def _coarse(start: _Sweep, masks: Sequence[NDArray[np.bool_]], mesh: trimesh.Tri
                 j = sweep.jacobian(v, rim)
                 hessian = hessian + j.T @ (j * weight[:, None])
                 gradient = gradient - j.T @ (weight * away)
-            step = np.linalg.solve(hessian + 1e-9 * np.diag(np.diag(hessian)), gradient)
-            sweep, total = sweep.moved(step), np.asarray(total + step)
-            if np.abs(step[: 6 + LENS][:3]).max() < 2e-4:
+            damped = hessian + 1e-9 * np.diag(np.diag(hessian))
+            update = np.asarray(np.linalg.solve(damped, gradient), np.float64)
+            sweep, total = sweep.moved(update), np.asarray(total + update)
+            if np.abs(update[:3]).max() < 2e-4:
                 break
         wrong = sum(int((mesh_mask(mesh, sweep.view(v)) ^ m).sum()) for v, m in enumerate(masks))
         if wrong < fewest:
@@ -217,14 +237,13 @@ def _centred(
 
 def _fine(
     sweep: _Sweep,
-    start: _Sweep,
     images: Sequence[NDArray[np.floating]],
     masks: Sequence[NDArray[np.bool_]],
     mesh: trimesh.Trimesh,
     lens: Sequence[F64],
 ) -> PoseFit:
     """Gauss-Newton on the edges, then the covariance from what the edges leave unexplained, sector by sector."""
-    precision = _priors(sweep, lens)
+    precision = _priors(sweep)
     total: F64 = np.zeros(sweep.size)
     rows: list[tuple[F64, F64, F64, NDArray[np.int64]]] = []
     variance = 0.05**2
@@ -244,9 +263,15 @@ def _fine(
     meat = scores.T @ scores * count / max(count - sweep.size, count / 4)
     for c in range(len(sweep.lenses)):
         common = sector // (SECTORS * len(sweep.angles)) == c
-        push = j[common].T @ weight[common] * (COMMON_EDGE_PX / variance)
+        together = np.hypot(COMMON_EDGE_PX, np.sqrt(variance / PATCHES))
+        push = j[common].T @ weight[common] * (together / variance)
         meat += np.outer(push, push)
-    covariance = inverse @ (meat + precision) @ inverse
+    # Lenses are held where the boards put them, but their errors are passed on (Schmidt's consider covariance).
+    held = _lens_rows(sweep)
+    follow = -inverse[:, ~held] @ hessian[np.ix_(~held, held)]
+    follow[held] = np.eye(int(held.sum()))
+    meat[held], meat[:, held] = 0.0, 0.0
+    covariance = inverse @ (meat + np.where(held, 0.0, precision)) @ inverse + follow @ block_diag(*lens) @ follow.T
     return _result(sweep, covariance, float(np.sqrt(variance)), len(rest), masks, mesh)
 
 

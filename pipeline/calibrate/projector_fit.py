@@ -156,6 +156,11 @@ class ProjectorFit:
     shift: F64
     shift_error: F64
 
+    def misses(self, points: F64, steps: F64, normals: F64, to_eye: F64) -> F64:
+        """(N, 2) mm from the beam's axis to spots, across it."""
+        value = np.concatenate([np.zeros(6), self.projector.full_angle_rad, self.shift])
+        return _across(self.projector, value, points, steps, normals, to_eye)
+
 
 def refine(
     start: TwoMirrorProjector,

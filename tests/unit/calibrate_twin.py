@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -15,11 +16,15 @@ from disco_twin.camera.lars3 import Lars3, lars3_sensor
 from disco_twin.camera.targets import TargetSource
 from disco_twin.deviation import ActualRig, actual_rig
 from disco_twin.faults import Stream, generator
+from disco_twin.rig import TargetRig, TwinRig
 from disco_twin.scene import load_scene
 from disco_twin.world import World
+from hw.interface import Aim
 from hw.record import to_radiance
 from pipeline.calibrate.camera import PinholeCamera
-from pipeline.capture.targets import Targets, make_targets
+from pipeline.capture.loop import capture
+from pipeline.capture.plan import make_plan
+from pipeline.capture.targets import FOLDER, TARGETS, Targets, make_targets, save_targets
 from pipeline.rig import RigConfig
 
 F64 = NDArray[np.float64]
@@ -95,3 +100,69 @@ def boards(seed: int, rig: RigConfig, camera: int) -> tuple[Targets, list[F32], 
         if p.kind == "board"
     ]
     return targets, images, actual.cameras[camera]
+
+
+class Glowing:
+    """A `ResponseSource` without transport: a matt surface with the beam's footprint and a glow that fades around it.
+
+    Where the light goes in and where the camera looks from move the peak as single scattering does: `shift` mm per unit
+    of the tangential parts (Godin et al. 2001).
+    """
+
+    def __init__(self, rig: RigConfig, actual: ActualRig, mesh: trimesh.Trimesh, shift: float = 0.1) -> None:
+        self.rig, self.actual, self.mesh, self.shift = rig, actual, mesh, shift
+        self.ray = RayMeshIntersector(mesh)
+        self._seen: dict[tuple[int, int], tuple[F64, F64, NDArray[np.bool_]]] = {}
+
+    def prepare(self, aims: Sequence[Aim]) -> None:
+        """Nothing to do."""
+
+    def silhouette(self, camera: int, angle: int) -> F32:
+        return floodlit(self.mesh, self.actual.camera(camera, angle))
+
+    def _surface(self, camera: int, angle: int) -> tuple[F64, F64, NDArray[np.bool_]]:
+        if (camera, angle) not in self._seen:
+            lens = self.actual.camera(camera, angle)
+            origin, way = lens.rays(lens.pixel_centres(2))
+            face = self.ray.intersects_first(origin, way)
+            hit = face >= 0
+            corner, normal = self.mesh.triangles[face, 0], self.mesh.face_normals[face]
+            along = ((corner - origin) * normal).sum(axis=1) / (way * normal).sum(axis=1)
+            tangent = -way - (-way * normal).sum(axis=1, keepdims=True) * normal
+            place = origin + along[:, None] * way - self.shift * tangent  # light seen here left from there
+            self._seen[camera, angle] = place, normal, hit
+        return self._seen[camera, angle]
+
+    def image(self, camera: int, aim: Aim, laser: int) -> F32:
+        place, normal, hit = self._surface(camera, aim.angle)
+        origin, way = (x[0] for x in self.actual.spot_rays([aim]))
+        lens, radius = self.actual.camera(camera, aim.angle), self.rig.projector.beam_diameter_mm / 2
+        spot, _, face = self.ray.intersects_location(origin[None], way[None], multiple_hits=False)
+        if not len(face):
+            return np.zeros((lens.height, lens.width), np.float32)
+        facing = self.mesh.face_normals[face[0]]
+        entry = place - self.shift * (way - (way @ facing) * facing)
+        away = entry - spot[0]
+        across = (away**2).sum(axis=1) - (away @ way) ** 2
+        lit = (across < radius**2) & (normal @ way < 0) & ((away**2).sum(axis=1) < (4 * radius) ** 2)
+        glow = np.exp(-np.linalg.norm(away, axis=1) / 3.0) / (2 * np.pi * 9.0)
+        light = np.where(hit, 0.25 * lit * -(normal @ way) / (np.pi * radius**2) + 0.4 * glow, 0.0) / np.pi
+        fine = light.reshape(lens.height, 2, lens.width, 2)
+        return np.asarray(fine.mean(axis=(1, 3)), np.float32)
+
+
+def capture_all(folder: Path, seed: int, spots: int = 90, mesh: trimesh.Trimesh | None = None) -> RigConfig:
+    """A whole capture of the quick scene's object by a seeded rig, calibration images included; the nominal rig."""
+    rig = faulty_rig()
+    on = dict.fromkeys(("warm_up", "blue_noise", "mode_hop", "speckle"), True)
+    rig = rig.model_copy(update={"faults": rig.faults.model_copy(update=on), "spots": spots})
+    actual = actual_rig(rig, seed)
+    for c, lens in enumerate(actual.cameras):
+        targets, plan = make_targets(rig, c)
+        own = folder / FOLDER / targets.camera
+        source = TargetSource(targets, lens, actual, rig.projector.beam_diameter_mm / 2)
+        capture(TargetRig(rig, source, seed, actual, c, len(targets.placements)), plan, own)
+        save_targets(targets, own / TARGETS)
+    source = Glowing(rig, actual, mesh or world().object.mesh)
+    capture(TwinRig(rig, source, seed, actual), make_plan(rig, world().scan), folder)
+    return rig

@@ -1,0 +1,123 @@
+"""What each part of the calibration costs: the same capture reconstructed with parts of the calibration made true.
+
+`disco-twin score --budget`. The truth goes to the pipeline here on purpose, into folders of the twin's own, and into no
+score of the run.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from disco_twin.camera.lars3 import lars3_sensor
+from disco_twin.deviation import ActualRig, actual_rig
+from disco_twin.folder import RunFolder, write_atomically
+from disco_twin.pipeline_process import reconstruct_apart
+from disco_twin.world import World
+from hw.errors import InputError
+from pipeline.calibrate.calibration import Calibration, nominal_calibration, pair, pose_rows
+from pipeline.rig import RigConfig
+
+FORMAT_VERSION = 1
+RECORD = "budget.json"
+
+
+@dataclass
+class VariantFolder(RunFolder):
+    """A folder to work in beside a run's own; capture and truth are the run's."""
+
+    base: RunFolder | None = None
+
+    @property
+    def capture(self) -> Path:
+        assert self.base is not None
+        return self.base.capture
+
+    @property
+    def twin(self) -> Path:
+        assert self.base is not None
+        return self.base.twin
+
+
+def true_calibration(rig: RigConfig, actual: ActualRig, nominal: Calibration) -> Calibration:
+    """The calibration that a measurement without error would give. Each mirror move's own error stays out of reach."""
+    views = []
+    for v, view in enumerate(nominal.views):
+        camera, angle = divmod(v, nominal.n_angles)
+        lens = actual.camera(camera, angle)
+        views.append(
+            view.model_copy(
+                update={
+                    "focal_px": pair(lens.focal),
+                    "centre_px": pair(lens.centre),
+                    "distortion": tuple(float(x) for x in lens.distortion),
+                    "object_to_camera": pose_rows(lens.pose),
+                    "radiance_factor": tuple(float(x) for x in actual.photodiode / actual.response[camera]),
+                }
+            )
+        )
+    projectors = [
+        p.model_copy(
+            update={
+                "full_angle_rad": pair(actual.projector.full_angle_rad),
+                "object_to_projector": pose_rows(actual.projector.seen_from(actual.turns[j]).pose),
+            }
+        )
+        for j, p in enumerate(nominal.projectors)
+    ]
+    return nominal.model_copy(update={"source": "measured", "views": tuple(views), "projectors": tuple(projectors)})
+
+
+def _photometric(own: Calibration, true: Calibration) -> Calibration:
+    pairs = zip(own.views, true.views, strict=True)
+    views = tuple(v.model_copy(update={"radiance_factor": t.radiance_factor}) for v, t in pairs)
+    return own.model_copy(update={"views": views})
+
+
+def _pose(own: Calibration, true: Calibration) -> Calibration:
+    pairs = zip(own.views, true.views, strict=True)
+    views = tuple(t.model_copy(update={"radiance_factor": v.radiance_factor}) for v, t in pairs)
+    return own.model_copy(update={"views": views})
+
+
+def _projector(own: Calibration, true: Calibration) -> Calibration:
+    return own.model_copy(update={"projectors": true.projectors})
+
+
+VARIANTS: dict[str, Callable[[Calibration, Calibration], Calibration]] = {
+    "true photometric": _photometric,
+    "true pose": _pose,
+    "true projector": _projector,
+    "all true": lambda _, true: true,
+}
+
+
+def score_budget(world: World, folder: RunFolder, method: str) -> list[dict[str, Any]]:
+    """Rows {calibration, light, view, nrmse, ...} of one method: as measured, uncalibrated, and each part made true."""
+    from disco_twin.score import score_relit_images
+
+    scene = world.scene
+    own = Calibration.load(folder.work / "calibration.json")
+    if own.source != "measured":
+        raise InputError(
+            "the calibration was not measured: nothing to replace by truth",
+            file=folder.work / "calibration.json",
+            remedy="disco-twin run SCENE --faults --out DIR",
+        )
+    nominal = nominal_calibration(scene.rig, lars3_sensor(scene.rig))
+    true = true_calibration(scene.rig, actual_rig(scene.rig, scene.seed), nominal)
+    rows = [{"calibration": "measured"} | row for row in score_relit_images(world, folder, (method,))]
+    wanted = {"nominal": nominal} | {name: make(own, true) for name, make in VARIANTS.items()}
+    for name, calibration in wanted.items():
+        variant = VariantFolder(folder.twin / "budget" / name.replace(" ", "-"), base=folder)
+        variant.work.mkdir(parents=True, exist_ok=True)
+        given = variant.root / "calibration.json"
+        calibration.save(given)
+        reconstruct_apart(scene, variant, (method,), given)
+        rows += [{"calibration": name} | row for row in score_relit_images(world, variant, (method,))]
+    record = {"format_version": FORMAT_VERSION, "method": method, "rows": rows}
+    write_atomically(folder.twin / RECORD, (json.dumps(record, indent=1) + "\n").encode())
+    return rows

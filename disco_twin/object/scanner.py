@@ -1,0 +1,42 @@
+"""The laser range scanner of the twin: points on the object's surface, off by what thesis figure 4.8 shows.
+
+A bare translucent object is seen too deep, by about a free path, and noisily: the light of the scanner's stripe leaves
+below the surface (Godin et al. 2001). A coat of spray ends that, and leaves its own thickness.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from disco_twin.faults import Stream, generator
+
+F64 = NDArray[np.float64]
+
+POINTS = 40_000
+NOISE_MM, COAT_MM = 0.05, 0.02  # of single points; thickness of the spray
+ERROR_MM, ERROR_LENGTH_MM, LARGEST_MM = 0.1, 10.0, 0.3  # geometry error: rms, correlation length, bound (thesis 4.4)
+BARE_DEPTH, BARE_NOISE = 0.5, 0.3  # of a free path: how much too deep a bare object is seen, and how noisily
+WAVES = 256
+
+
+def scan_points(mesh: trimesh.Trimesh, seed: int, free_path_mm: float = 0.0, sprayed: bool = True) -> tuple[F64, F64]:
+    """(N, 3) points in mm and (N, 3) unit normals; free_path_mm matters for a bare object."""
+    rng = generator(seed, Stream.SCANNER)
+    points, face = trimesh.sample.sample_surface_even(mesh, POINTS, seed=int(rng.integers(2**31)))
+    normals = np.asarray(mesh.face_normals)[face]
+    error = np.clip(geometry_error(points, rng), -LARGEST_MM, LARGEST_MM)
+    error += NOISE_MM * rng.standard_normal(len(points))
+    if sprayed:
+        error += COAT_MM
+    else:
+        error += free_path_mm * (-BARE_DEPTH + BARE_NOISE * rng.standard_normal(len(points)))
+    return np.asarray(points + error[:, None] * normals), normals
+
+
+def geometry_error(points: F64, rng: np.random.Generator) -> F64:
+    """(N,) mm, a smooth random field: waves whose spectrum is that of a Gaussian correlation."""
+    wave = rng.standard_normal((WAVES, 3)) * np.sqrt(2.0) / ERROR_LENGTH_MM
+    phase = rng.uniform(0, 2 * np.pi, WAVES)
+    return np.asarray(ERROR_MM * np.sqrt(2.0 / WAVES) * np.cos(points @ wave.T + phase).sum(axis=1))

@@ -1,0 +1,383 @@
+"""The calibration of a captured rig, from its own images alone: lenses, white balance, poses, projector.
+
+Reads CAPTURE/calibration/<camera>/ (boards and the white plate) and, from the capture itself, silhouettes and spots.
+Every stage starts from the nominal rig and knows how far a set-up may be off it; none knows more.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+from hw.errors import DiscoError, InputError
+from hw.record import RawImage, Sensor, to_radiance
+from pipeline.calibrate.calibration import (
+    Calibration,
+    LaserCalibration,
+    ProjectorCalibration,
+    ViewCalibration,
+    pair,
+    pose_rows,
+    triple,
+)
+from pipeline.calibrate.camera import PinholeCamera, turn
+from pipeline.calibrate.intrinsics import Intrinsics, board_pose, find_corners, fit_intrinsics
+from pipeline.calibrate.peaks import Peak, brightness, find_peak, seen
+from pipeline.calibrate.photometric import Balance, balance, pixel_areas
+from pipeline.calibrate.pose import PoseFit, fit_poses
+from pipeline.calibrate.projector import TwoMirrorProjector
+from pipeline.calibrate.projector_fit import GATE, ProjectorFit, StepSize, projection, refine, step_size
+from pipeline.capture.plan import ImageAddress
+from pipeline.capture.stream import CorruptImage, StreamReader
+from pipeline.capture.targets import FOLDER, TARGETS, Targets
+from pipeline.rig import RigConfig
+
+F64 = NDArray[np.float64]
+
+log = logging.getLogger(__name__)
+
+PLATE_DISTANCE_MM = 2.0  # how well a ruler knows the plate's distance from the projector
+FALSE_STEPS = 60.0  # a spot that a matrix misses by more is false
+PATCH_MM = 10.0  # within which the object moves the peaks of spots alike
+PLATE_SPOT_MM = 0.05  # how well a spot's place on the white plate is seen
+
+
+@dataclass(frozen=True)
+class CameraImages:
+    """What one camera's target capture says."""
+
+    lens: PinholeCamera  # nominal place, measured lens
+    intrinsics: Intrinsics
+    balance: Balance
+    plate_points: F64  # (N, 3) mm, spots on the white plate in the camera's frame
+    plate_steps: F64  # (N, 2)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The calibration, and what each stage says about itself."""
+
+    calibration: Calibration
+    cameras: tuple[CameraImages, ...]
+    poses: PoseFit
+    projector: ProjectorFit
+    step_size: StepSize
+
+    def report(self) -> dict[str, object]:
+        """Figures for people and for pipeline.json: all in mm, degrees, pixels, shares."""
+        fit, poses = self.projector, self.poses
+        return {
+            "reprojection_px": [c.intrinsics.reprojection_px for c in self.cameras],
+            "boards": [len(c.intrinsics.used) for c in self.cameras],
+            "focal_error": [
+                float(np.sqrt(c.intrinsics.covariance[0, 0]) / c.intrinsics.values[0]) for c in self.cameras
+            ],
+            "power_drift": [float(x) for x in np.max([c.balance.drift for c in self.cameras], axis=0)],
+            "power_scatter": [float(x) for x in np.max([c.balance.scatter for c in self.cameras], axis=0)],
+            "silhouette_residual_px": poses.residual_px,
+            "silhouette_xor_px": list(poses.xor_pixels),
+            "pose_error_deg": float(np.rad2deg(poses.rotation.max())),
+            "pose_error_mm": [float(x) for x in poses.translation.max(axis=0)],
+            "ambiguity": list(poses.ambiguity),
+            "projector_residual_mm": fit.rms_mm,
+            "spots_false": int(fit.false.sum()),
+            "spots_used": int((~fit.false).sum()),
+            "peak_shift_mm": {"along_light": float(fit.shift[0]), "towards_camera": float(fit.shift[1])},
+            "peak_shift_error_mm": [float(x) for x in fit.shift_error],
+        }
+
+
+def has_targets(capture: Path, rig: RigConfig) -> bool:
+    """Whether calibration images of every camera lie beside the capture."""
+    return all((capture / FOLDER / c.name / TARGETS).is_file() for c in rig.cameras)
+
+
+def measure(capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh) -> Measured:
+    """All stages. `mesh`: the scan, object frame, mm."""
+    cameras = [read_targets(capture / FOLDER / c.name, rig, i, sensor) for i, c in enumerate(rig.cameras)]
+    angles = [float(a) for a in np.deg2rad(rig.turntable_angles_deg)]
+    with StreamReader(capture) as stream:
+        stream.require_complete()
+        poses = measure_poses(stream, sensor, mesh, cameras, angles)
+        size = plane_measurement(rig, cameras, poses, angles)
+        fit = measure_projector(stream, rig, sensor, mesh, poses, size)
+        watts = mean_power(stream)
+    for text in poses.ambiguity:
+        log.warning("the silhouettes leave open: %s", text)
+    return Measured(assemble(rig, sensor, cameras, poses, fit, watts), tuple(cameras), poses, fit, size)
+
+
+def _intact(raw: RawImage | CorruptImage) -> RawImage:
+    if isinstance(raw, CorruptImage):
+        raise raw
+    return raw
+
+
+def read_targets(folder: Path, rig: RigConfig, camera: int, sensor: Sensor) -> CameraImages:
+    """Lens and white balance of one camera."""
+    try:
+        targets = TypeAdapter(Targets).validate_json((folder / TARGETS).read_bytes())
+    except ValueError as error:
+        raise InputError("cannot be read", file=folder / TARGETS, remedy="take the calibration images again") from error
+    nominal, board = PinholeCamera.from_config(rig.cameras[camera]), targets.corners()
+    with StreamReader(folder) as stream:
+        stream.require_complete()
+        corners: dict[int, F64 | None] = {}
+        for i, place in enumerate(targets.placements):
+            if place.kind == "board":
+                raw = _intact(stream.read(ImageAddress(i, "silhouette")))
+                corners[i] = find_corners(to_radiance(raw, sensor, 0).radiance, board)
+        found = fit_intrinsics(list(corners.values()), board, nominal)
+        lens = found.lens(nominal)
+        mounts = {targets.placements[i].mount: c for i, c in corners.items() if c is not None}
+        poses = {
+            i: board_pose(mounts[p.mount], board, lens)
+            for i, p in enumerate(targets.placements)
+            if p.kind == "white" and p.mount in mounts
+        }
+        if not poses:
+            raise DiscoError(
+                f"{folder}: no white plate's place is known. Remedy: photograph the board in the same mount"
+            )
+        white, points, steps = _plates(stream, targets, sensor, lens, poses, rig)
+    return CameraImages(lens, found, white, points, steps)
+
+
+def _plates(
+    stream: StreamReader, targets: Targets, sensor: Sensor, lens: PinholeCamera, poses: dict[int, F64], rig: RigConfig
+) -> tuple[Balance, F64, F64]:
+    """Balance, and the spots' (N, 3) places in the camera's frame with their (N, 2) steps."""
+    plan, lasers = stream.plan, stream.plan.lasers
+    gain = 1.0 / illumination(lens)
+    light: list[list[float]] = []
+    reading: list[list[float]] = []
+    place, points, steps = [], [], []
+    beam_px = rig.projector.beam_diameter_mm * float(lens.focal.mean()) / next(iter(poses.values()))[2, 3]
+    config = rig.cameras[[c.name for c in rig.cameras].index(targets.camera)]
+    for i, pose in poses.items():
+        area, lit = pixel_areas(lens, pose), _same_side(config, rig, np.array(targets.placements[i].pose))
+        share = np.array(targets.reflected if lit else targets.transmitted)
+        for spot in plan.spots_at(i):
+            sums, watts, peaks = [], [], []
+            for laser in range(lasers):
+                address = ImageAddress(i, "spot", spot, laser)
+                image = to_radiance(_intact(stream.read(address)), sensor, laser)
+                radiance = image.radiance * gain
+                sums.append(float((radiance * area).sum(dtype=np.float64)) / share[laser])
+                watts.append(stream.meta(address).photodiode_w)
+                peaks.append(find_peak(radiance))
+            if any(p.at_border for p in peaks) or not seen(peaks, np.array(watts), beam_px, 0.0).any():
+                continue
+            light.append(sums)
+            reading.append(watts)
+            place.append(targets.placements[i].mount)
+            points.append(_on_plane(lens, np.mean([p.pixel for p in peaks], axis=0), pose))
+            steps.append((plan.spots[spot].u, plan.spots[spot].v))
+    if len(points) < 4:
+        raise DiscoError(f"{targets.camera}: the white plate's spots are not seen. Remedy: check the plate's place")
+    white = balance(np.array(light).T, np.array(reading).T, np.ones(lasers), np.array(place))
+    return white, np.array(points), np.array(steps, float)
+
+
+def illumination(lens: PinholeCamera) -> F64:
+    """(H, W) cos^4 of the angle off the axis."""
+    xy = lens.undistort((lens.pixel_centres() - lens.centre) / lens.focal)
+    return np.asarray((1.0 + (xy**2).sum(axis=1)).reshape(lens.height, lens.width) ** -2)
+
+
+def _same_side(config: object, rig: RigConfig, pose: F64) -> bool:
+    """Whether the camera sees the plate's lit side (nominally)."""
+    to_camera = np.subtract(config.position_mm, pose[:3, 3])  # type: ignore[attr-defined]
+    to_laser = np.subtract(rig.projector.position_mm, pose[:3, 3])
+    return bool((to_camera @ pose[:3, 2]) * (to_laser @ pose[:3, 2]) > 0)
+
+
+def _on_plane(lens: PinholeCamera, pixel: F64, pose: F64) -> F64:
+    """(3,) where a pixel's ray meets the plane z = 0 of a (4, 4) plane -> camera; camera's frame."""
+    xy = lens.undistort(((pixel - lens.centre) / lens.focal)[None])[0]
+    ray = np.array([*xy, 1.0])
+    return np.asarray(ray * (pose[:3, 3] @ pose[:3, 2]) / (ray @ pose[:3, 2]))
+
+
+def measure_poses(
+    stream: StreamReader,
+    sensor: Sensor,
+    mesh: trimesh.Trimesh,
+    cameras: Sequence[CameraImages],
+    angles: Sequence[float],
+) -> PoseFit:
+    """From the silhouette image of every view."""
+    images = []
+    for view in range(stream.plan.views):
+        raw = _intact(stream.read(ImageAddress(view, "silhouette")))
+        images.append(to_radiance(raw, sensor, 0).radiance / illumination(cameras[stream.plan.camera_of(view)].lens))
+    lenses = [c.lens.seen_from(turn(angles[0])) for c in cameras]
+    return fit_poses(images, mesh, lenses, angles, [c.intrinsics.covariance for c in cameras])
+
+
+def plane_measurement(
+    rig: RigConfig, cameras: Sequence[CameraImages], poses: PoseFit, angles: Sequence[float]
+) -> StepSize:
+    """The projector's step size from the spots on the white plate of the camera that sees most of them."""
+    best = max(range(len(cameras)), key=lambda c: len(cameras[c].plate_points))
+    here = cameras[best]
+    nominal = TwoMirrorProjector.from_config(rig.projector)
+    to_object = np.linalg.inv(poses.views[best * len(angles)].pose)
+    to_projector = nominal.seen_from(turn(angles[0])).pose @ to_object
+    local = here.plate_points @ to_projector[:3, :3].T + to_projector[:3, 3]
+    return step_size(local[:, :2], here.plate_steps, local[:, 2], PLATE_DISTANCE_MM, nominal, PLATE_SPOT_MM)
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Peaks of one laser in all images that could be read. view, spot: (N,); power: (N,) W."""
+
+    view: NDArray[np.int64]
+    spot: NDArray[np.int64]
+    power: F64
+    peaks: tuple[Peak, ...]
+
+
+def find_peaks(stream: StreamReader, sensor: Sensor, laser: int) -> Sightings:
+    """Every spot image of a laser: where its brightest place lies."""
+    plan = stream.plan
+    wanted = [a for a in plan.addresses() if a.kind == "spot" and a.laser == laser]
+    view, spot, power, peaks = [], [], [], []
+    for address, raw in zip(wanted, stream.read_many(wanted), strict=True):
+        watts = stream.meta(address).photodiode_w
+        if not isinstance(raw, CorruptImage) and watts > 0:
+            view.append(address.view)
+            spot.append(address.spot)
+            power.append(watts)
+            peaks.append(find_peak(to_radiance(raw, sensor, laser).radiance))
+    return Sightings(np.array(view, np.int64), np.array(spot, np.int64), np.array(power), tuple(peaks))
+
+
+def measure_projector(
+    stream: StreamReader, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh, poses: PoseFit, size: StepSize
+) -> ProjectorFit:
+    """From the spots on the object, in the object frame at the first angle. All cameras' sightings count."""
+    plan, ray = stream.plan, RayMeshIntersector(mesh)
+    found = find_peaks(stream, sensor, plan.lasers // 2)
+    bright = brightness(found.peaks, found.power)
+    places, normals, eyes, spots, patches, views = [], [], [], [], [], []
+    for view in range(plan.views):
+        camera, back = poses.views[view], poses.turns[plan.angle_of(view)]
+        here = np.flatnonzero(found.view == view)
+        peaks = [found.peaks[k] for k in here]
+        beam_px = rig.projector.beam_diameter_mm * float(camera.focal.mean()) / float(camera.pose[2, 3])
+        good = seen(peaks, found.power[here], beam_px, bright)
+        pixels = np.array([p.pixel for p, g in zip(peaks, good, strict=True) if g]).reshape(-1, 2)
+        origin, way = camera.rays(pixels)
+        place, which, face = ray.intersects_location(origin, way, multiple_hits=False)
+        if not len(face):
+            continue
+        weights = trimesh.triangles.points_to_barycentric(mesh.triangles[face], place)
+        normal = (mesh.vertex_normals[mesh.faces[face]] * weights[:, :, None]).sum(axis=1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        places.append(place @ back[:3, :3].T + back[:3, 3])
+        normals.append(normal @ back[:3, :3].T)
+        eyes.append(-way[which] @ back[:3, :3].T)
+        spots.append(found.spot[here][good][which])
+        views.append(np.full(len(which), view))
+        cell = np.floor(place / PATCH_MM).astype(np.int64) + 500
+        patches.append(((plan.angle_of(view) * 1000 + cell[:, 0]) * 1000 + cell[:, 1]) * 1000 + cell[:, 2])
+    if not places:
+        raise DiscoError("no camera sees any spot. Remedy: check that the laser reaches the object")
+    place, normal, eye, spot = (np.concatenate(x) for x in (places, normals, eyes, spots))
+    steps = np.array([(plan.spots[s].u, plan.spots[s].v) for s in spot], float)
+    group = np.unique(np.concatenate(patches), return_inverse=True)[1]
+    first = float(np.deg2rad(rig.turntable_angles_deg[0]))
+    nominal = TwoMirrorProjector.from_config(rig.projector).seen_from(turn(first))
+    true = projection(place, steps, FALSE_STEPS, np.random.default_rng(0)).inliers
+    fit = refine(nominal, place[true], steps[true], normal[true], eye[true], size, group[true])
+    # A matrix from a few noisy spots is a coarse sieve; the model itself says better which sightings are true.
+    true = np.linalg.norm(fit.misses(place, steps, normal, eye), axis=1) < GATE * fit.rms_mm
+    log.info("projector: %d of %d sightings of %d images agree", int(true.sum()), len(spot), len(found.peaks))
+    fit = refine(nominal, place[true], steps[true], normal[true], eye[true], size, group[true])
+    return with_pose_error(fit, poses, int(np.bincount(np.concatenate(views)[true]).argmax()))
+
+
+def with_pose_error(fit: ProjectorFit, poses: PoseFit, view: int) -> ProjectorFit:
+    """The same with the error of the object's rotation before the camera that saw most spots, which it shares."""
+    to_projector = fit.projector.pose[:3, :3] @ poses.views[view].pose[:3, :3].T
+    covariance = fit.covariance.copy()
+    covariance[:3, :3] += to_projector @ np.diag(poses.rotation[view] ** 2) @ to_projector.T
+    return replace(fit, covariance=covariance)
+
+
+def mean_power(stream: StreamReader) -> F64:
+    """(L,) mean of the photodiode over the capture's spot images, W."""
+    total, count = np.zeros(stream.plan.lasers), np.zeros(stream.plan.lasers)
+    for address in stream.plan.addresses():
+        if address.kind == "spot":
+            total[address.laser] += stream.meta(address).photodiode_w
+            count[address.laser] += 1
+    return np.asarray(total / np.maximum(count, 1))
+
+
+def assemble(
+    rig: RigConfig,
+    sensor: Sensor,
+    cameras: Sequence[CameraImages],
+    poses: PoseFit,
+    fit: ProjectorFit,
+    watts: F64,
+) -> Calibration:
+    """The calibration file's content."""
+    angles = [float(a) for a in np.deg2rad(rig.turntable_angles_deg)]
+    views = []
+    for v, camera in enumerate(poses.views):
+        own = cameras[v // len(angles)]
+        spread = np.sqrt(np.diag(own.intrinsics.covariance))
+        views.append(
+            ViewCalibration(
+                camera=rig.cameras[v // len(angles)].name,
+                angle_rad=angles[v % len(angles)],
+                width=camera.width,
+                height=camera.height,
+                focal_px=pair(camera.focal),
+                centre_px=pair(camera.centre),
+                distortion=tuple(float(x) for x in camera.distortion),  # type: ignore[arg-type]
+                object_to_camera=pose_rows(camera.pose),
+                focal_error_px=float(spread[0]),
+                centre_error_px=pair(spread[1:3]),
+                rotation_error_rad=triple(poses.rotation[v]),
+                translation_error_mm=triple(poses.translation[v]),
+                radiance_factor=tuple(float(x) for x in own.balance.factor),
+                radiance_factor_error=tuple(float(x) for x in own.balance.error),
+            )
+        )
+    spread = np.sqrt(np.diag(fit.covariance))
+    projectors = []
+    for j, angle in enumerate(angles):
+        seen_from = replace(fit.projector).seen_from(poses.turns[j])
+        projectors.append(
+            ProjectorCalibration(
+                angle_rad=angle,
+                steps=seen_from.steps,
+                full_angle_rad=pair(seen_from.full_angle_rad),
+                separation_mm=seen_from.separation_mm,
+                beam_diameter_mm=rig.projector.beam_diameter_mm,
+                object_to_projector=pose_rows(seen_from.pose),
+                rotation_error_rad=triple(spread[:3]),
+                translation_error_mm=triple(spread[3:6]),
+                full_angle_error_rad=pair(spread[6:8]),
+            )
+        )
+    scatter = np.max([c.balance.scatter for c in cameras], axis=0)
+    lasers = tuple(
+        LaserCalibration(wavelength_nm=config.wavelength_nm, power_w=float(w), power_error_w=float(w * s))
+        for config, w, s in zip(rig.lasers, watts, scatter, strict=True)
+    )
+    return Calibration(
+        source="measured", views=tuple(views), projectors=tuple(projectors), lasers=lasers, sensor=sensor
+    )

@@ -1,0 +1,123 @@
+"""The whole calibration from a capture's own images, against what the twin knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from calibrate_twin import capture_all, world
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+from disco_twin.budget import true_calibration
+from disco_twin.camera.lars3 import lars3_sensor
+from disco_twin.deviation import actual_rig
+from pipeline.calibrate.calibration import Calibration, nominal_calibration
+from pipeline.calibrate.measure import Measured, measure
+from pipeline.capture.plan import load_plan
+from pipeline.rig import RigConfig
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """spots_mm: rms on the surface; incidence_deg, balance: largest errors; scores: z-scores by stage."""
+
+    spots_mm: float
+    incidence_deg: float
+    balance: float
+    scores: dict[str, F64]
+
+
+def judge(found: Measured, rig: RigConfig, seed: int, folder: Path) -> Judged:
+    own, actual = found.calibration, actual_rig(rig, seed)
+    true = true_calibration(rig, actual, nominal_calibration(rig, lars3_sensor(rig)))
+    aims = load_plan(folder / "plan.json").spots
+    places = [_hits(world().object.mesh, *c.spot_rays(aims)) for c in (_steady(rig, seed), own)]
+    away = np.linalg.norm(places[0] - places[1], axis=1)
+    ways = [c.spot_rays(aims)[1] for c in (true, own)]
+    turned = np.arccos(np.clip((ways[0] * ways[1]).sum(axis=1), -1, 1))
+    pose, light = [], []
+    for view, (mine, best) in enumerate(zip(own.views, true.views, strict=True)):
+        a, b = own.view_camera(view).pose, true.view_camera(view).pose
+        rotation = Rotation.from_matrix(b[:3, :3] @ a[:3, :3].T).as_rotvec()
+        assert mine.rotation_error_rad is not None
+        assert mine.translation_error_mm is not None
+        pose.append(np.concatenate([rotation / mine.rotation_error_rad, (b - a)[:3, 3] / mine.translation_error_mm]))
+        light.append((np.array(best.radiance_factor) - mine.radiance_factor) / np.array(mine.radiance_factor_error))
+    a, b, errors = own.projector(0).pose, true.projector(0).pose, own.projectors[0]
+    assert errors.rotation_error_rad is not None
+    assert errors.translation_error_mm is not None
+    assert errors.full_angle_error_rad is not None
+    wide = (true.projector(0).full_angle_rad - own.projector(0).full_angle_rad) / errors.full_angle_error_rad
+    turn = Rotation.from_matrix(b[:3, :3] @ a[:3, :3].T).as_rotvec() / errors.rotation_error_rad
+    projector = np.concatenate([turn, (b - a)[:3, 3] / errors.translation_error_mm, wide])
+    lens = [
+        (actual.cameras[c].focal[0] - own.views[c * own.n_angles].focal_px[0])
+        / (own.views[c * own.n_angles].focal_error_px or 1.0)
+        for c in range(own.n_cameras)
+    ]
+    ratio = [np.array(m.radiance_factor) / t.radiance_factor - 1 for m, t in zip(own.views, true.views, strict=True)]
+    scores = {"pose": np.array(pose), "light": np.array(light), "projector": projector, "lens": np.array(lens)}
+    kept = np.isfinite(away) & (away < 3.0)  # beyond: one of the two beams passes the rim
+    assert kept.mean() > 0.95
+    return Judged(
+        float(np.sqrt((away[kept] ** 2).mean())), float(np.rad2deg(turned.max())), float(np.abs(ratio).max()), scores
+    )
+
+
+def _steady(rig: RigConfig, seed: int) -> Calibration:
+    actual = actual_rig(rig, seed)
+    return true_calibration(rig, actual, nominal_calibration(rig, lars3_sensor(rig)))
+
+
+def _hits(mesh: trimesh.Trimesh, origins: F64, ways: F64) -> F64:
+    out = np.full((len(origins), 3), np.nan)
+    place, ray, _ = RayMeshIntersector(mesh).intersects_location(origins, ways, multiple_hits=False)
+    out[ray] = place
+    return out
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RigConfig]:
+    folder = tmp_path_factory.mktemp("capture")
+    return folder, capture_all(folder, 11)
+
+
+def test_a_rig_is_calibrated_from_its_own_images(captured: tuple[Path, RigConfig]) -> None:
+    """Faults on. Expected: spots within .15 mm rms, directions within .3 degrees, white balance to half a percent."""
+    folder, rig = captured
+    found = measure(folder, rig, lars3_sensor(rig), world().object.mesh)
+    judged = judge(found, rig, 11, folder)
+    assert judged.spots_mm < 0.15
+    assert judged.incidence_deg < 0.3
+    assert judged.balance < 0.005
+    report = found.report()
+    assert max(report["reprojection_px"]) < 0.15
+    assert (np.array(report["power_drift"])[1:] > 0.1).all()
+    assert (np.array(report["power_scatter"]) < 0.005).all()
+    again = Calibration.model_validate_json(found.calibration.model_dump_json())
+    assert again == found.calibration
+    assert again.source == "measured"
+    assert all(np.abs(z).max() < 6 for z in judged.scores.values())
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1500)
+def test_uncertainties_are_honest(tmp_path: Path) -> None:
+    """Twelve rigs: z-scores of every stage have a root mean square between .8 and 1.25 (lens: few, so .5 to 1.5)."""
+    scores: dict[str, list[F64]] = {}
+    for seed in range(12):
+        folder = tmp_path / str(seed)
+        rig = capture_all(folder, 50 + seed)
+        judged = judge(measure(folder, rig, lars3_sensor(rig), world().object.mesh), rig, 50 + seed, folder)
+        for name, z in judged.scores.items():
+            scores.setdefault(name, []).append(z.ravel())
+    rms = {name: float(np.sqrt((np.concatenate(z) ** 2).mean())) for name, z in scores.items()}
+    assert all(0.8 < rms[name] < 1.25 for name in ("pose", "light", "projector")), rms
+    assert 0.5 < rms["lens"] < 1.5, rms
