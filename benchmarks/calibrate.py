@@ -143,9 +143,12 @@ def xor_search(
 
     simplex = np.vstack([np.zeros(6), 4.0 * np.eye(6)])
     options: Any = {"maxfev": evaluations, "initial_simplex": simplex, "xatol": 1e-4, "fatol": 0.1}
-    best = minimize(
-        lambda x: float((mesh_mask(mesh, moved(x)) ^ mask).sum()), np.zeros(6), method="Nelder-Mead", options=options
-    )
+
+    def mismatch(x: Any) -> float:
+        return float((mesh_mask(mesh, moved(x)) ^ mask).sum())
+
+    nowhere: Any = np.zeros(6)
+    best = minimize(mismatch, nowhere, method="Nelder-Mead", options=options)
     return moved(best.x)
 
 

@@ -16,9 +16,11 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 from disco_twin.budget import true_calibration
 from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.deviation import actual_rig
+from disco_twin.faults import LaserPower
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
 from pipeline.calibrate.measure import Measured, measure
 from pipeline.capture.plan import load_plan
+from pipeline.capture.stream import StreamReader
 from pipeline.rig import RigConfig
 
 F64 = NDArray[np.float64]
@@ -90,21 +92,39 @@ def captured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RigConfig]
 
 
 def test_a_rig_is_calibrated_from_its_own_images(captured: tuple[Path, RigConfig]) -> None:
-    """Faults on. Expected: spots within .15 mm rms, directions within .3 degrees, white balance to half a percent."""
+    """Faults on. Expected: spots within .15 mm rms, directions within .3 degrees, white balance to .75 %."""
     folder, rig = captured
     found = measure(folder, rig, lars3_sensor(rig), world().object.mesh)
     judged = judge(found, rig, 11, folder)
     assert judged.spots_mm < 0.15
     assert judged.incidence_deg < 0.3
-    assert judged.balance < 0.005
+    assert judged.balance < 0.0075  # speckle, and the light that the lens throws outside the image
     report = found.report()
     assert max(report["reprojection_px"]) < 0.15
     assert (np.array(report["power_drift"])[1:] > 0.1).all()
-    assert (np.array(report["power_scatter"]) < 0.005).all()
+    assert (np.array(report["power_scatter"]) < 0.012).all()  # five per cent of speckle on some thirty pixels
     again = Calibration.model_validate_json(found.calibration.model_dump_json())
     assert again == found.calibration
     assert again.source == "measured"
     assert all(np.abs(z).max() < 6 for z in judged.scores.values())
+
+
+def test_the_power_of_every_image_is_known(captured: tuple[Path, RigConfig]) -> None:
+    """To half a percent, up to the photodiode's own gain, while the power itself drifts by far more than a tenth."""
+    folder, rig = captured
+    power, actual = LaserPower(rig.lasers, rig.faults, 11), actual_rig(rig, 11)
+    frame = rig.sensor.longest_exposure_s
+    ratio: list[list[float]] = [[], [], []]
+    watts: list[list[float]] = [[], [], []]
+    with StreamReader(folder) as stream:
+        for address in stream.plan.addresses():
+            if address.kind == "spot":
+                meta = stream.meta(address)
+                true = power.watts(address.laser, meta.time_s - 0.5 * frame)
+                ratio[address.laser].append(meta.photodiode_w / actual.photodiode[address.laser] / true)
+                watts[address.laser].append(true)
+    assert np.abs(np.array(ratio) - 1).max() < 0.005
+    assert (np.ptp(watts, axis=1) > 0.1 * np.mean(watts, axis=1))[[0, 2]].all()
 
 
 @pytest.mark.slow
