@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_twin.assembly import Connector, free_line, open_camera, require_black
+from disco_twin.folder import write_atomically
 from disco_twin.rig_file import EMULATED, DevicesFile, GenicamDevice
 from hw.clock import WallClock
 from hw.errors import DeviceFault, DiscoError, InputError
@@ -284,7 +285,8 @@ def served(scene: RigConfig, seed: int, folder: Path) -> Iterator[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     with Server(emulated_devices(scene, seed).lines, folder) as server:
         path = folder / "rig.toml"
-        path.write_text(rig_file_of(scene, {name: str(Path(url).absolute()) for name, url in server.urls.items()}))
+        ports = {name: str(Path(url).absolute()) for name, url in server.urls.items()}
+        write_atomically(path, rig_file_of(scene, ports).encode())
         yield path
 
 

@@ -11,7 +11,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol, Self, TypeVar
 
 from hw.clock import Clock
 from hw.devices.mm_ard import ADC_TOP
@@ -21,9 +21,11 @@ from hw.interface import Aim, Camera, Floodlight, Laser, Photodiode, Projector, 
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T")
+
 HEARD_S = 0.02  # until what was told without waiting for an answer has been understood
-OPENINGS = 3
-PROMPT_S = 0.1  # a line is set in a few milliseconds; a reply that is waited for in vain takes longer
+ATTEMPTS = 3
+PROMPT_S = 0.1  # lines and mirrors are set in a few milliseconds; a reply that is waited for in vain takes longer
 SETTLE_S = 0.005  # of the galvos, after the DAC has taken both values
 
 
@@ -135,7 +137,8 @@ class SerialRig:
         self._warm_up_s, self._power_tolerance = warm_up_s, power_tolerance
         self._timebase: Timebase = Elapsed(clock) if timebase is None else timebase
         self._devices: Devices | None = None
-        self._pattern, self._last_open, self._aim = 0, -1, centre
+        self._pattern, self._last_open = 0, -1
+        self._aim, self._aimed = centre, False  # where the mirrors were told to stand; whether that is certain
         self.lasers: Sequence[Laser] = [GatedLaser(self, i) for i in range(len(self.wiring))]
         self.projector: Projector = Mirrors(self)
         self.turntable: Turntable = Turning(self)
@@ -232,41 +235,57 @@ class SerialRig:
         """Whether a line is switched on."""
         return bool(self._pattern >> line & 1)
 
+    def ask(self, question: Callable[[Board], T]) -> T:
+        """Say something to the board. If that had to be repeated, the mirrors are not trusted any more.
+
+        A board that is reset forgets where the mirrors stand, and its armed line falls until lines are set again: a
+        reset is seen by that line (`require_lines`), or by an answer that did not come at once.
+        """
+        begun = self.clock.now()
+        answer = question(self.devices().board)
+        if self.clock.now() - begun > PROMPT_S:
+            log.warning("the mirror board was slow to answer: the mirrors will be aimed anew")
+            self._aimed = False
+        return answer
+
     def switch(self, line: int, on: bool) -> None:
         """One line, the others as they are. A line that may have been switched counts as on."""
-        board, before = self.devices().board, self._pattern
+        before = self._pattern
         after = before | 1 << line if on else before & ~(1 << line)
         self._pattern = before | after
-        board.set_lines(after)
+        self.ask(lambda board: board.set_lines(after))
         self._pattern = after
 
     def open_line(self, line: int) -> None:
-        """Open a gate, being certain that the mirrors still stand where they were told to.
-
-        A board that is reset forgets them, and its armed line falls, until lines are set again: so it is looked at
-        before. If setting the line had to be repeated, a reset may hide in between: then the mirrors are aimed anew.
-        """
-        for _ in range(OPENINGS):
+        """Open a gate, being certain that the mirrors stand where they were told to."""
+        for _ in range(ATTEMPTS):
+            if not self._aimed:
+                self.aim(*self._aim)
             self.require_lines()
-            begun = self.clock.now()
             self.switch(line, True)
-            if self.clock.now() - begun < PROMPT_S:
+            if self._aimed:
                 return
-            log.warning("the mirror board was slow to open a gate: shutting it and aiming anew")
             self.switch(line, False)
-            self.aim(*self._aim)
-        problem = f"did not open a gate promptly in {OPENINGS} attempts"
-        raise DeviceFault("board", "the mirror board", problem, "check its cable and power supply")
+        raise self._slow("open a gate")
 
     def aim(self, u: int, v: int) -> None:
         """Mirror steps; returns when the mirrors have settled."""
-        self.devices().board.set_mirrors(u, v)
         self._aim = (u, v)
-        self.clock.sleep(SETTLE_S)
+        for _ in range(ATTEMPTS):
+            self._aimed = True
+            self.ask(lambda board: board.set_mirrors(u, v))
+            if self._aimed:
+                self.clock.sleep(SETTLE_S)
+                return
+        raise self._slow("aim its mirrors")
+
+    def _slow(self, what: str) -> DeviceFault:
+        problem = f"did not {what} promptly in {ATTEMPTS} attempts"
+        return DeviceFault("board", "the mirror board", problem, "check its cable and power supply")
 
     def require_lines(self) -> None:
         """Refuse an image during which the board was reset: gates and mirrors have moved."""
-        found = self.devices().board.lines()
+        found = self.ask(lambda board: board.lines())
         if found != self._pattern:
             problem = f"has its TTL lines at {found:06b} instead of {self._pattern:06b}: it was reset"
             raise DeviceFault("board", "the mirror board", problem, "check its power supply, then repeat the command")
@@ -345,12 +364,12 @@ class AdcPhotodiode:
 
     def read(self) -> float:
         """Watts on the object; refused when they are not those that the laser was set to."""
-        board, laser = self.rig.devices().board, self.rig.last_open
+        laser = self.rig.last_open
         if laser < 0:
             return 0.0
         self.rig.require_lines()
         wiring = self.rig.wiring[laser]
-        counts = board.counts(wiring.pin)
+        counts = self.rig.ask(lambda board: board.counts(wiring.pin))
         watts = counts * wiring.watts_per_count
         low, high = wiring.limits
         if self.rig.open_gate == laser and (counts >= ADC_TOP or not low <= watts / (wiring.power_mw * 1e-3) <= high):

@@ -18,6 +18,7 @@ from hw.errors import InputError
 
 log = logging.getLogger(__name__)
 
+HEARTBEAT_S = 10.0  # cameras wait 3 s by default for a sign of life
 SLICE_MS = 20  # a wait is cut into these, so that Ctrl-C is obeyed
 OFF = ("ExposureAuto", "GainAuto", "BlackLevelAuto", "BalanceWhiteAuto")  # what would make the sensor non-linear
 
@@ -72,7 +73,7 @@ class VivaGrabber:
             for _ in range(3):  # discovery is a broadcast, which nobody repeats when it is lost
                 found = [d for d in vg.discover(1000, all=True) if d.ip == address]
                 if found:
-                    return vg.connect_gige(found[0])
+                    return self._claim(found[0])
             found = [d for d in _on_usb(vg) if d.serial == address]
             if found:
                 return vg.connect_u3v(found[0])
@@ -82,6 +83,18 @@ class VivaGrabber:
             f"camera {address} does not answer; in reach are: {', '.join(discover()) or 'none'}. Remedy: check power, "
             "cable and address; one program at a time can control a camera"
         )
+
+    def _claim(self, device: Any) -> Any:
+        """Take control; a program that was killed keeps it until its heartbeat is missed."""
+        end = time.monotonic() + HEARTBEAT_S
+        while True:
+            try:
+                return self._vg.connect_gige(device)
+            except self._vg.GenicamError as error:
+                if "ACCESS_DENIED" not in str(error) or time.monotonic() > end:
+                    raise
+                log.info("camera %s is controlled by another program; waiting", self._address)
+                time.sleep(0.5)
 
     def _refuse_other(self, serial: str | None) -> None:
         found = self._camera.get("DeviceSerialNumber") if self._has("DeviceSerialNumber") else None
