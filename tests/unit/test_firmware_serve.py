@@ -25,10 +25,13 @@ from disco_twin.firmware.turning import Spindle
 from disco_twin.firmware.wire import Line
 from disco_twin.firmware.zaber import MICROSTEPS_PER_DEG, ZaberFirmware
 from disco_twin.rig import TwinRig
+from hw.bytelog import ByteLog, ReplayPeer, read_log
+from hw.clock import VirtualClock
 from hw.devices.mm_ard import MirrorBoard
 from hw.devices.omicron import OmicronLaser
 from hw.devices.zaber import ZaberTable
 from hw.errors import Unplugged
+from hw.ports.protocol_memory import attach
 from hw.serial_link import Link
 from pipeline.capture.loop import capture
 
@@ -72,6 +75,27 @@ def test_drivers_work_through_terminals_and_sockets(served: tuple[Desk, Server])
         device.close()
     assert desk.head.on_since is None
     assert desk.mirrors.lines == 0
+
+
+def test_a_session_that_was_recorded_in_real_time_replays(served: tuple[Desk, Server], tmp_path: Path) -> None:
+    """As the first run on a bench will be: recorded with all its pauses, replayed in no time on a virtual clock."""
+    desk, server = served
+    log = tmp_path / "logs" / "laser.log"
+
+    def session(link: Link) -> tuple[object, ...]:
+        laser = OmicronLaser(link, 532.0)
+        laser.arm(30.0)
+        laser.emit()
+        result = (laser.identity, laser.status(), laser.measured_mw())
+        laser.close()
+        return result
+
+    recorded = session(Link(server.urls["laser"], 500_000, "laser 532 nm", desk.clock, ByteLog(log)))
+    events = read_log(log)
+    clock = VirtualClock(events[0].time_s)
+    peer = ReplayPeer(events, clock)
+    assert session(Link(attach("recorded", peer), 500_000, "laser 532 nm", clock)) == recorded
+    assert peer.finished
 
 
 def test_unplug_and_replug(served: tuple[Desk, Server]) -> None:
