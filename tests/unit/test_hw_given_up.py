@@ -24,34 +24,39 @@ def gave_up(ask: Callable[[], object]) -> bool:
     return False
 
 
-def give_up(bus: Bus, ask: Callable[[], object], delay: float) -> None:
+def give_up(bus: Bus, ask: Callable[[], object], delay: float, losses: int) -> None:
     """Lose answers until the driver gives up; the last ones come late."""
-    bus.line.answer_faults.extend([lost, lost, lost, lost, *[late(delay)] * 8])
+    bus.line.answer_faults.extend([*[lost] * losses, *[late(delay)] * 8])
     any(gave_up(ask) for _ in range(5))
     bus.line.answer_faults.clear()
 
 
+@pytest.mark.parametrize("losses", range(7))
 @pytest.mark.parametrize("delay", DELAYS)
-def test_laser(delay: float) -> None:
+def test_laser(delay: float, losses: int) -> None:
     bench = LaserBench()
     laser = bench.connect()
     laser.arm(40.0)
     laser.emit()
-    give_up(bench, laser.measured_mw, delay)
+    give_up(bench, laser.measured_mw, delay, losses)
     bench.head.level = 0.7
     assert laser.measured_mw() == pytest.approx(70.0)
 
 
+@pytest.mark.parametrize("losses", range(7))
 @pytest.mark.parametrize("delay", DELAYS)
-def test_board(delay: float) -> None:
+def test_board(delay: float, losses: int) -> None:
     value = [100]
     bench = BoardBench(head=MirrorHead(sample=lambda pin: value[0]))
     board = bench.connect()
-    give_up(bench, lambda: board.counts(0), delay)
+    give_up(bench, lambda: board.counts(0), delay, losses)
     value[0] = 900
     assert board.counts(0) == 900
+    give_up(bench, board.lines, delay, losses)
+    bench.head.set_pattern(0b101)
+    assert board.lines() == 0b101
     board.set_lines(0b11)
-    give_up(bench, lambda: board.counts(0), delay)
+    give_up(bench, lambda: board.counts(0), delay, losses)
     before, seen = bench.now(), []
     write = board.link.write
 
@@ -64,21 +69,23 @@ def test_board(delay: float) -> None:
     assert seen[0] == (0.0, 0)  # dark at once, in step later
 
 
+@pytest.mark.parametrize("losses", range(7))
 @pytest.mark.parametrize("delay", DELAYS)
 @pytest.mark.parametrize("make", [TableBench, ElliptecBench])
-def test_turntables(make: type[TableBench] | type[ElliptecBench], delay: float) -> None:
+def test_turntables(make: type[TableBench] | type[ElliptecBench], delay: float, losses: int) -> None:
     bench = make()
     table = bench.connect()
     table.home()
-    give_up(bench, table.angle_rad, delay)
+    give_up(bench, table.angle_rad, delay, losses)
     bench.spindle.go(90.0, bench.now() - 100.0)
     assert table.angle_rad() == pytest.approx(math.pi / 2, abs=1e-4)
 
 
+@pytest.mark.parametrize("losses", range(7))
 @pytest.mark.parametrize("delay", DELAYS)
-def test_meter(delay: float) -> None:
+def test_meter(delay: float, losses: int) -> None:
     bench = MeterBench(watts=1e-3)
     meter = bench.connect()
-    give_up(bench, meter.read, delay)
+    give_up(bench, meter.read, delay, losses)
     bench.watts = 5e-3
     assert meter.read() == pytest.approx(5e-3)
