@@ -6,8 +6,8 @@ G solves one symmetric positive definite system: the samples at the spots' baryc
 reciprocity, rows; smoothness over the surface on both sides fills the rest. Values are compared with their expectation
 linearly and weighted by precision (`Measured.residual`), so that a noisy tail neither dominates nor turns negative.
 
-The fit fills what was not measured. An entry next to a spot holds the sample itself (`hold_measured`), wherever noise
-leaves it more certain than the fill: nothing that was measured is overwritten (docs/decisions/0013).
+The fit fills what was not measured. An entry next to a spot holds the sample itself, as far as noise lets it speak
+(`hold_measured`): nothing that was measured is overwritten by fill (docs/decisions/0013).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from scipy import sparse
 from pipeline.reconstruct.exitance import measure_boundary
 from pipeline.reconstruct.harmonics import Harmonics, harmonics
 from pipeline.reconstruct.model import ReflectanceModel
-from pipeline.reconstruct.profile import Measured, Tilt, fit_profile, scatter
+from pipeline.reconstruct.profile import Measured, Tilt, fit_profile
 from pipeline.reconstruct.samples import ANGULAR, Glow, Samples
 from pipeline.reconstruct.spots import outward_tilt
 
@@ -62,7 +62,8 @@ class SymmetricField:
         """Matern on both sides: separable, so that G is smooth along rows and columns alike."""
         rough = basis.roughness(range_mm)
         penalty = rough[:, None] * rough[None, :]
-        penalty *= (1.0 / penalty).sum()
+        # Y is symmetric: two entries off the diagonal are one unknown, of half the variance.
+        penalty *= 0.5 * ((1.0 / penalty).sum() + (1.0 / np.diag(penalty)).sum())
         functions = basis.functions.astype(np.float32)
         return cls(functions, np.asarray(to_spots @ functions, np.float32), penalty.astype(np.float32))
 
@@ -136,15 +137,15 @@ def fit_laser(samples: Samples, laser: int, field: SymmetricField, start: F32) -
     return Fit(entries, pairs.mean(profile) * np.exp(smooth), tilt, y)
 
 
-def hold_measured(samples: Samples, fits: list[Fit], lift: F64) -> tuple[F64, F64, NDArray[np.bool_]]:
-    """(L, V, V) R_d that holds the samples where they are good, its relative variance, and (V, V) where that is.
+def hold_measured(samples: Samples, fits: list[Fit], lift: F64, left: F64) -> tuple[F64, F64, NDArray[np.bool_]]:
+    """(L, V, V) R_d in mm^-2 that holds what was measured, its relative variance, and (V, V) the measured entries.
 
-    lift: (V, V) expectation over the fit, where the fit stands alone.
+    lift: (V, V) expectation over the fit; left: (V, V) relative variance of the fill, where nothing was measured.
 
     A sample is the mean over a beam and a hat function in one direction, an entry the mean over two hat functions and
     all directions. The fit says what lies between: sample / its expectation = entry / its expectation. Spots whose
-    triangle the vertex belongs to are averaged by their share and precision, and by reciprocity from both sides. Held
-    are entries whose noise has at most half the variance of the scatter that is assumed about the fit, in all lasers.
+    triangle the vertex belongs to are averaged by their share and precision, and by reciprocity from both sides. A
+    measured entry is the mean of that and of the fill, by their precisions: the sample itself unless noise drowns it.
     """
     used = np.flatnonzero(samples.spots.transmitted > 0)
     share = sparse.csr_array(
@@ -154,9 +155,8 @@ def hold_measured(samples: Samples, fits: list[Fit], lift: F64) -> tuple[F64, F6
         ),
         shape=(len(samples.mesh.vertices), len(samples.values[0])),
     )
-    squared, edge = share.multiply(share).tocsr(), float(samples.mesh.edges_unique_length.mean())
-    limit = 0.5 * scatter(samples.vertex_pairs.distance / edge) ** 2
-    ratios, variances, held = [], [], measured_entries(samples)
+    squared, measured_in_all = share.multiply(share).tocsr(), measured_entries(samples)
+    entries, variances = [], []
     for laser, fit in enumerate(fits):
         measured = Measured.of(samples, laser)
         expected = fit.at_spots * np.exp(fit.tilt(samples.spot_pairs.distance) * samples.tilt)
@@ -165,12 +165,14 @@ def hold_measured(samples: Samples, fits: list[Fit], lift: F64) -> tuple[F64, F6
         ratio = share @ (weight * np.where(measured.observed, measured.value / expected, 0.0))
         total = share @ weight
         spread = squared @ (weight**2 * variance)
-        total = np.maximum(total + total.T, 1e-30)
-        ratios.append((ratio + ratio.T) / total)
-        variances.append((spread + spread.T) / total**2)
-        held &= (variances[-1] < limit) & (ratios[-1] > 0)
-    entries = np.stack([fit.entries * np.where(held, ratio, lift) for fit, ratio in zip(fits, ratios, strict=True)])
-    return entries, np.stack(variances) + BOTH_ENDS, held
+        for sums in (ratio, total, spread):
+            sums += np.where(np.eye(len(sums), dtype=bool), 0.0, sums.T)  # on the diagonal both sides are one sample
+        ratio = ratio / np.maximum(total, 1e-30)
+        noise = np.where(measured_in_all, spread / np.maximum(total, 1e-30) ** 2, np.inf)
+        trust = left / (left + noise)  # of the sample against the fill
+        entries.append(np.maximum(fit.entries * (trust * np.where(trust > 0, ratio, 0.0) + (1 - trust) * lift), 0.0))
+        variances.append((1 - trust) * left)  # = 1 / (1 / left + 1 / noise)
+    return np.stack(entries), np.stack(variances), measured_in_all
 
 
 def unexplained(samples: Samples, basis: Harmonics, range_mm: float) -> F64:
@@ -186,7 +188,7 @@ def unexplained(samples: Samples, basis: Harmonics, range_mm: float) -> F64:
     gain = np.linalg.solve(cross @ to_spots.T + noise * np.eye(len(cross)), cross)
     explained = (cross * gain).sum(axis=0) / np.diag(covariance)
     share = np.abs(gain) / np.maximum(np.abs(gain).sum(axis=0), 1e-12)
-    seen = share.T @ np.isfinite(samples.values[0, used]).astype(np.float64)
+    seen = share.T @ np.isfinite(samples.values[:, used]).all(axis=0).astype(np.float64)
     left = 1.0 - explained[:, None] * seen
     return np.asarray(np.clip(np.minimum(left, left.T), 0.0, 1.0))
 
@@ -210,8 +212,7 @@ def complete(samples: Samples) -> ReflectanceModel:
     edges = samples.vertex_pairs.distance / edge
     left = deviation(edges) ** 2 * unexplained(samples, basis, RANGE_EDGES * edge)
     # What is left open about log R_d raises the expectation of R_d: the mean of a log-normal.
-    reflectance, relative, held = hold_measured(samples, fits, np.exp(0.5 * left))
-    filled = left + BOTH_ENDS
+    reflectance, relative, measured = hold_measured(samples, fits, np.exp(0.5 * left), left + BOTH_ENDS)
 
     def expected(glow: Glow) -> F64:
         tilt = sum(outward_tilt(samples.mesh, samples.spots, glow.camera.position))
@@ -221,8 +222,8 @@ def complete(samples: Samples) -> ReflectanceModel:
     return ReflectanceModel(
         samples.mesh,
         reflectance.astype(np.float32),
-        (reflectance**2 * np.where(held, relative, filled)).astype(np.float32),
-        held,
+        (reflectance**2 * (relative + BOTH_ENDS)).astype(np.float32),
+        measured,
         measure_boundary(samples.mesh, samples.eta, samples.glow, expected),
         {"method": "default"},
     )

@@ -155,10 +155,11 @@ class _Gathered:
         for angle in range(len(self.plan.angles_rad)):
             spots = self.plan.spots_at(angle)
             part = np.s_[:, spots.start : spots.stop]
-            signal = np.where(np.isfinite(self.value[part]), np.maximum(self.value[part], 0.0), 0.0)
+            read = np.isfinite(self.value[part])
+            signal = np.where(read, np.maximum(self.value[part], 0.0), 0.0)
             # Clipped after the mean: single estimates scatter to both sides, and clipping each would raise them all.
             seen, own = (
-                np.maximum(v[part].sum(axis=1, keepdims=True) - self.dark[part].sum(axis=1, keepdims=True), 0.0)
+                np.maximum(np.where(read, v[part] - self.dark[part], 0.0).sum(axis=1, keepdims=True), 0.0)
                 for v in (self.noise, self.shot)
             )
             extra, total = np.maximum(seen, own), signal.sum(axis=1, keepdims=True)
@@ -171,9 +172,10 @@ class _Gathered:
 
         Weights must not come from the samples that they weigh: low ones would seem precise.
         """
-        count = 40
-        edges = np.quantile(distance, np.linspace(0, 1, count + 1))
-        group = np.clip(np.searchsorted(edges, distance) - 1, 0, count - 1).ravel()
+        nearest = np.partition(distance, 40, axis=None)[40]  # enough entries in the first bin
+        edges = np.geomspace(nearest, distance.max(), 40)
+        count = len(edges) + 1
+        group = np.searchsorted(edges, distance).ravel()
         out = []
         for value in self.value:
             seen = np.isfinite(value)

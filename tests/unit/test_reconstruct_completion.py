@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from reconstruct_synthetic import make
+from reconstruct_synthetic import Synthetic, make
 
+from pipeline.calibrate.fresnel import Boundary
+from pipeline.reconstruct import completion
 from pipeline.reconstruct.completion import (
     RANGE_EDGES,
     SymmetricField,
     complete,
     deviation,
     fit_laser,
+    hold_measured,
     measured_entries,
 )
 from pipeline.reconstruct.dipole import dipole_reflectance, fit_dipole, fit_dipole_laser
@@ -24,6 +28,7 @@ from pipeline.reconstruct.mesh import vertex_areas
 from pipeline.reconstruct.methods import METHODS, reconstruct
 from pipeline.reconstruct.needs import colour_groups, is_opaque
 from pipeline.reconstruct.profile import Measured, fit_profile, scatter
+from pipeline.reconstruct.samples import Samples
 from pipeline.reconstruct.spots import outward_tilt
 
 
@@ -88,54 +93,105 @@ def test_variance_covers_the_error(small) -> None:  # type: ignore[no-untyped-de
     assert (np.abs(z) > 4).mean() < 0.01
 
 
-def test_measured_entries_hold_the_samples() -> None:
-    """Rationale: spots that lie on vertices. An entry (u, v) is held by the sample of the spot at u read at v, carried
-    from beam to hat function by the ratio of their means over the profile; by both samples where v is lit, too.
-    Expected behaviour: exactly that, whatever the samples say - half of them are off by 40 % from entry to entry, which
-    no smooth fill would follow - and nothing else is called measured.
-    """
-    made = make(spots=80, noise=0.01, contrast=0.0)
+def spots_on_vertices(made: Synthetic, rng: np.random.Generator) -> tuple[Samples, np.ndarray, np.ndarray]:
+    """Samples without noise whose spots lie on vertices and are off by 40 % from entry to entry; spots; vertices."""
     s = made.samples
-    rng = np.random.default_rng(7)
-    corner = np.tile([1.0, 0.0, 0.0], (80, 1))
     lit = s.mesh.faces[s.spots.triangle, 0]
     first = np.unique(lit, return_index=True)[1]
-    transmitted = np.where(np.isin(np.arange(80), first), s.spots.transmitted, 0.0)
+    transmitted = np.where(np.isin(np.arange(len(lit)), first), s.spots.transmitted, 0.0)
+    corner = np.tile([1.0, 0.0, 0.0], (len(lit), 1))
     spots = replace(s.spots, barycentric=corner, position=np.asarray(s.mesh.vertices)[lit], transmitted=transmitted)
     values = (s.values * np.exp(0.4 * rng.choice([-1, 0, 1], s.values.shape))).astype(np.float32)
     values[:, transmitted == 0] = np.nan
-    s = replace(s, spots=spots, values=values)
+    none = np.zeros_like(values)
+    tilt = rng.uniform(-0.8, 0.2, s.values[0].shape)
+    values = values * np.exp(0.3 * tilt).astype(np.float32)
+    return (
+        replace(s, spots=spots, values=values, dark_variance=none, noise_per_signal=none, tilt=tilt),
+        first,
+        lit[first],
+    )
+
+
+def test_measured_entries_hold_the_samples() -> None:
+    """Rationale: spots that lie on vertices. An entry (u, v) is held by the sample of the spot at u read at v, carried
+    from beam to hat function and from one direction to all by the ratio of the fit's expectations.
+    Expected behaviour: without noise exactly that, whatever the samples say - most of them are off by 40 % from entry
+    to entry, which no smooth fill would follow; every entry that one spot observed, and no other, is called measured.
+    """
+    s, spots, vertices = spots_on_vertices(make(spots=80, noise=0.0, contrast=0.0), np.random.default_rng(7))
     model = complete(s)
-    basis = harmonics(s.mesh, 500)
-    edge = float(s.mesh.edges_unique_length.mean())
-    smooth = SymmetricField.of(basis, s.lit, RANGE_EDGES * edge)
+    smooth = SymmetricField.of(harmonics(s.mesh, 500), s.lit, RANGE_EDGES * float(s.mesh.edges_unique_length.mean()))
     fit = fit_laser(s, 0, smooth, np.zeros_like(smooth.penalty))
+    expected = fit.at_spots * np.exp(fit.tilt(s.spot_pairs.distance) * s.tilt)
+    assert np.abs(fit.tilt(np.array([1.0, 3.0])) * 0.5).max() > 0.05  # the samples' tilt was seen
+    observed = np.isfinite(s.values[0])
+    by_one_spot = np.zeros_like(model.measured)
     checked = 0
-    for spot in first:
-        u = lit[spot]
-        for v in np.flatnonzero(model.measured[u]):
-            ends = [(spot, v)] + [(other, u) for other in first if lit[other] == v and other != spot]
-            ends = [(a, b) for a, b in ends if np.isfinite(s.values[0, a, b])]
-            if len(ends) == 1:
-                ((a, b),) = ends
-                expected = fit.at_spots[a, b] * np.exp(fit.tilt(s.spot_pairs.distance)[a, b] * s.tilt[a, b])
-                assert model.reflectance[0, u, v] == pytest.approx(
-                    s.values[0, a, b] * fit.entries[u, v] / expected, rel=1e-5
-                )
+    for spot, u in zip(spots, vertices, strict=True):
+        by_one_spot[u, observed[spot]] = True
+        for v in np.flatnonzero(observed[spot]):
+            other = [q for q, w in zip(spots, vertices, strict=True) if w == v and q != spot and observed[q, u]]
+            if not other:
+                held = s.values[0, spot, v] * fit.entries[u, v] / expected[spot, v]
+                assert model.reflectance[0, u, v] == pytest.approx(held, rel=1e-5)
+                assert model.reflectance[0, v, u] == model.reflectance[0, u, v]
                 checked += 1
     assert checked > 1000
-    only_lit = np.zeros_like(model.measured)
-    only_lit[lit[first]] = True
-    assert not (model.measured & ~(only_lit | only_lit.T)).any()
-    np.testing.assert_array_equal(model.reflectance[0], model.reflectance[0].T)
+    assert (by_one_spot | by_one_spot.T)[model.measured].mean() > 0.3
+    assert model.measured[by_one_spot | by_one_spot.T].all()
 
 
-def test_noise_is_not_held() -> None:
-    """Rationale: samples that are noisier than the fill would be are no reason to leave the fill."""
-    s = make(noise=0.02).samples
-    drowned = replace(s, noise_per_signal=(s.noise_per_signal * 1e4).astype(np.float32))
-    assert complete(s).measured.mean() > 0.3
-    assert complete(drowned).measured.sum() == 0
+def test_noise_decides_between_sample_and_fill() -> None:
+    """Rationale: one spot per vertex; noise as large as the fill's own deviation moves the entry half-way to the fill.
+    Expected behaviour: the mean by precisions, and the variance that goes with it; the entry stays measured.
+    """
+    s, _, _ = spots_on_vertices(make(spots=80, noise=0.0, contrast=0.0), np.random.default_rng(8))
+    smooth = SymmetricField.of(harmonics(s.mesh, 500), s.lit, 6.0)
+    fit = fit_laser(s, 0, smooth, np.zeros_like(smooth.penalty))
+    one, left = np.ones_like(fit.entries), np.full_like(fit.entries, 0.09)
+    sure, nothing, measured = hold_measured(s, [fit], one, left)
+    expected = fit.at_spots * np.exp(fit.tilt(s.spot_pairs.distance) * s.tilt)
+    noisy = replace(s, dark_variance=(0.09 * expected**2)[None].astype(np.float32))
+    between, half, again = hold_measured(noisy, [fit], one, left)
+    np.testing.assert_array_equal(measured, again)
+    single = measured & (half[0] > 0.044)  # entries with one spot; those with two or three trust them more
+    assert single.sum() > 1000
+    np.testing.assert_allclose(between[0][single], 0.5 * (sure[0] + fit.entries)[single], rtol=1e-3)
+    np.testing.assert_allclose(half[0][single], 0.045, rtol=1e-3)
+    assert nothing[0][measured].max() < 1e-6
+    np.testing.assert_array_equal(nothing[0][~measured], 0.09)
+
+
+def test_prior_of_the_field_has_unit_variance(small) -> None:  # type: ignore[no-untyped-def]
+    """Rationale: draw Y from exp(-Y penalty Y / 2) over symmetric Y; G = U Y U^T is to have mean variance 1."""
+    field = SymmetricField.of(harmonics(small.samples.mesh, 500), small.samples.lit, 3.0)
+    rng, n = np.random.default_rng(9), len(field.penalty)
+    drawn = []
+    for _ in range(40):
+        y = rng.standard_normal((n, n)) / np.sqrt(2 * field.penalty)  # a pair (i, j), (j, i) costs 2 penalty y^2 / 2
+        y = np.tril(y, -1)
+        y = y + y.T + np.diag(rng.standard_normal(n) / np.sqrt(np.diag(field.penalty)))
+        drawn.append(((field.vertices @ y @ field.vertices.T) ** 2).mean())
+    z = (np.mean(drawn) - 1) / (np.std(drawn) / np.sqrt(len(drawn)))
+    assert abs(z) < 4
+
+
+def test_the_boundary_is_compared_with_what_each_view_expects(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rationale: what directions do to R_d is in the expectation, or the boundary's ratio would take it for its own."""
+    s, _, _ = spots_on_vertices(make(spots=80, noise=0.0, contrast=0.0), np.random.default_rng(7))
+    asked = []
+    monkeypatch.setattr(completion, "measure_boundary", lambda *a: asked.append(a) or Boundary(1.3))
+    complete(s)
+    ((_, _, _, expected),) = asked
+    eyes = [np.array([300.0, 0, 0]), np.array([0, 0, -300.0])]
+    views = [expected(SimpleNamespace(camera=SimpleNamespace(position=eye)))[0] for eye in eyes]
+    lean = [sum(outward_tilt(s.mesh, s.spots, eye)) for eye in eyes]
+    ratio, difference = np.log(views[0] / views[1]), lean[0] - lean[1]
+    smooth = SymmetricField.of(harmonics(s.mesh, 500), s.lit, RANGE_EDGES * float(s.mesh.edges_unique_length.mean()))
+    slope = fit_laser(s, 0, smooth, np.zeros_like(smooth.penalty)).tilt(s.spot_pairs.distance)
+    assert np.abs(slope * difference).max() > 0.1
+    np.testing.assert_allclose(ratio, slope * difference, atol=1e-5)
 
 
 def test_size_does_not_matter(small) -> None:  # type: ignore[no-untyped-def]
