@@ -23,6 +23,7 @@ M = TypeVar("M")
 
 SLICE_S = 0.02  # a port is never waited for longer at a time: the precision of time limits
 WRITE_TIMEOUT_S = 1.0
+HEARD_BYTES = 40
 REMEDY = "check cable and power, and the port's name in the rig file (`disco-twin rig probe` lists what answers)"
 
 if "hw.ports" not in serial.protocol_handler_packages:
@@ -65,6 +66,7 @@ class Link:
 
     def __init__(self, url: str, baud: int, device: str, clock: Clock, log: ByteLog | None = None) -> None:
         self.url, self.device, self.clock, self._log = url, device, clock, log
+        self._heard = b""
         try:
             self._port = serial.serial_for_url(
                 url, baudrate=baud, timeout=SLICE_S, write_timeout=WRITE_TIMEOUT_S, exclusive=True
@@ -79,6 +81,7 @@ class Link:
             self._port.write(data)
         except OSError as error:
             raise self._lost("does not take bytes any more", error) from error
+        self._heard = b""
         self._note(">", data)
 
     def read(self, timeout_s: float) -> bytes:
@@ -96,8 +99,13 @@ class Link:
         except OSError as error:
             raise self._lost("cannot be read any more", error) from error
         if data:
+            self._heard = (self._heard + data)[:HEARD_BYTES]
             self._note("<", data)
         return data
+
+    def heard(self) -> str:
+        """What has come since the last question, in words: for errors about devices that speak something else."""
+        return f"{self._heard!r} came" if self._heard else "nothing answered"
 
     def close(self) -> None:
         """Give the port back and end the log; never raises, may be called twice."""

@@ -93,7 +93,7 @@ class ElliptecTable:
         try:
             answer = self._ask("in", "IN", str)
         except NoAnswer as error:
-            raise self._wrong(f"is not an Elliptec stage: it {error.problem}") from error
+            raise self._wrong(f"is not an Elliptec stage: asked {self._address}in, {self.link.heard()}") from error
         try:
             kind, serial, travel, pulses = int(answer[2:4], 16), answer[4:12], int(answer[20:24], 16), answer[24:32]
             steps = int(pulses, 16)

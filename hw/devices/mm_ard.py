@@ -92,7 +92,7 @@ class MirrorBoard:
         try:
             self._exchange(bytes([IDENTIFY]), IDENTITY)
         except (NoAnswer, Garbled) as error:
-            raise self._wrong(f"is not an MM-Ard board: {error.problem}") from error
+            raise self._wrong(f"is not an MM-Ard board: asked {IDENTIFY}, {self.link.heard()}") from error
         version = self._line(VERSION)
         channels = self._exchange(bytes([CHANNELS]), bytes([CHANNELS]), 1)[0] if version >= 5 else 0
         if channels < 2:

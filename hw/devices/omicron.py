@@ -138,7 +138,7 @@ class OmicronLaser:
         try:
             answer = self.ask("GFw")
         except (NoAnswer, DeviceRefused) as error:
-            raise self._wrong(f"is not {expected}: nothing answered ?GFw") from error
+            raise self._wrong(f"is not {expected}: asked ?GFw, {self.link.heard()}") from error
         fields = SEPARATOR.split(answer)
         if len(fields) < 3 or not fields[1].isdigit() or int(fields[1]) not in MODELS:
             raise self._wrong(f"is not {expected}: ?GFw was answered by {answer[:40]!r}")

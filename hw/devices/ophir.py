@@ -75,7 +75,7 @@ class OphirMeter:
         try:
             answer = self._ask("II", str)
         except (NoAnswer, DeviceRefused) as error:
-            raise self._wrong(f"is not an Ophir meter: it {error.problem}") from error
+            raise self._wrong(f"is not an Ophir meter: asked $II, {self.link.heard()}") from error
         model = answer.split()[0].upper() if answer else ""
         if model not in METERS:
             raise self._wrong(f"is not an Ophir meter that is known here: it answered {answer[:40]!r}")

@@ -159,7 +159,7 @@ class ZaberTable:
         try:
             self.ask("")
         except NoAnswer as error:
-            raise self._wrong(f"is not a Zaber stage: it {error.problem}") from error
+            raise self._wrong(f"is not a Zaber stage: asked for its status, {self.link.heard()}") from error
         self._checked = self.ask("set comm.checksum 1").accepted
         if not self._checked:
             log.warning("%s: its firmware sends no checksums; a garbled digit may go unnoticed", self.link.device)
