@@ -121,8 +121,9 @@ class RunFolder:
         folder.identity = identity
         for path in (folder.capture, folder.twin, folder.work):
             path.mkdir(parents=True, exist_ok=True)
-        write_atomically(folder.scene_file, scene_file.read_bytes())
-        folder._save()
+        with folder.alone():
+            write_atomically(folder.scene_file, scene_file.read_bytes())
+            folder._save()
         return folder
 
     def run(self, name: str, key: str, work: Callable[[], float | None], outputs: Sequence[str] = ()) -> bool:
@@ -131,16 +132,18 @@ class RunFolder:
         outputs: patterns of the files that it leaves; where one is missing or cut later, the stage is done again.
         `work` may return the peak memory in MiB of a process of its own, which then counts as the stage's.
         """
-        record = self.stages.get(name)
-        if record is not None and record.key == key and record.finished:
-            if record.intact(self.root):
-                return False
-            log.warning("%s: a file is missing or cut, the stage is done again", name)
-            record = None
-        if record is None or record.key != key:
-            record = StageRecord(name, key)
-        self.stages[name] = record
-        with self._alone():
+        with self.alone():
+            if self.journal.is_file():
+                self._load()  # another process may have worked here since
+            record = self.stages.get(name)
+            if record is not None and record.key == key and record.finished:
+                if record.intact(self.root):
+                    return False
+                log.warning("%s: a file is missing or cut, the stage is done again", name)
+                record = None
+            if record is None or record.key != key:
+                record = StageRecord(name, key)
+            self.stages[name] = record
             self._save()  # whatever ends this process from here on, the files are no longer those of a finished stage
             self._work(record, work, outputs)
         return True
@@ -162,7 +165,7 @@ class RunFolder:
             self._save()
 
     @contextmanager
-    def _alone(self) -> Iterator[None]:
+    def alone(self) -> Iterator[None]:
         """No other process works in the folder meanwhile."""
         handle = os.open(self.root, os.O_RDONLY)
         try:

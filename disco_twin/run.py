@@ -36,7 +36,14 @@ OUTPUTS = {  # files that a finished stage leaves, as patterns in the run folder
     "pipeline": ("work/pipeline.json", "work/model-*.npz", "work/request.json", "work/relit/*/*.npy"),
     "scores": ("twin/scores.json",),
 }
-LIGHT_CODE = tuple(f"disco_twin.{part}" for part in ("object", "light", "camera", "rig", "deviation", "faults"))
+LIGHT_CODE = (  # what the simulated light and the images of it come from
+    *(
+        f"disco_twin.{part}"
+        for part in ("object", "light", "camera", "rig", "deviation", "faults", "world", "simulate")
+    ),
+    *(f"pipeline.{part}" for part in ("capture.sweep", "capture.plan", "calibrate.camera", "calibrate.projector")),
+    "hw.record",
+)
 SCENE_RECORD = "scene.json"  # the scene as it was run: profile applied, file names absolute
 
 
@@ -117,6 +124,12 @@ def drop_old_light(folder: RunFolder, key: str) -> None:
     marker = folder.twin / "light.key"
     if marker.is_file() and marker.read_text() == key:
         return
+    with folder.alone():
+        _drop(folder)
+        write_atomically(marker, key.encode())
+
+
+def _drop(folder: RunFolder) -> None:
     old = [] if folder.taken_by_devices else [folder.capture / name for name in (IMAGES, JOURNAL, PLAN)]
     old += [] if folder.taken_by_devices else [*folder.capture.glob("calibration/*/*")]
     old += [*folder.twin.glob("responses/spots-*.npy"), *folder.twin.glob("references/*.exr")]
@@ -125,7 +138,6 @@ def drop_old_light(folder: RunFolder, key: str) -> None:
         log.warning("the simulation's code has changed: the light in %s is simulated again", folder.root)
     for path in old:
         path.unlink()
-    write_atomically(marker, key.encode())
 
 
 def capture_stages(run: Run) -> None:

@@ -13,7 +13,7 @@ from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.relight.lights import Colour, Light, shipped_lights
 from pipeline.rig import CameraConfig, FaultsConfig, RigConfig
 
-Count = Annotated[int, Field(ge=1, le=10**10)]
+Count = Annotated[int, Field(ge=1, lt=2**32)]  # photons are numbered in 32 bits
 Profile = Literal["full", "small"]
 
 

@@ -44,8 +44,8 @@ def write_scan(world: World, capture: Path, sensor: Sensor | None = None) -> Non
     require_capturable(world)
     write_atomically(capture / "scan.ply", bytes(world.scan.export(file_type="ply")))
     told = world.scene.rig.model_copy(update={"faults": FaultsConfig()})  # which faults are on is the twin's secret
-    known = SensorFile(sensor=sensor_of(world, sensor))
-    write_atomically(capture / "rig.json", RigFile(rig=told).model_dump_json(indent=1).encode())
+    known = SensorFile(format_version=1, sensor=sensor_of(world, sensor))
+    write_atomically(capture / "rig.json", RigFile(format_version=1, rig=told).model_dump_json(indent=1).encode())
     write_atomically(capture / "sensor.json", known.model_dump_json(indent=1).encode())
 
 

@@ -14,14 +14,14 @@ from pipeline.rig import RigConfig
 class RigFile(Strict):
     """CAPTURE/rig.json: the nominal rig."""
 
-    format_version: Literal[1] = 1
+    format_version: Literal[1]
     rig: RigConfig
 
 
 class SensorFile(Strict):
     """CAPTURE/sensor.json: what is known of the cameras' sensor."""
 
-    format_version: Literal[1] = 1
+    format_version: Literal[1]
     sensor: Annotated[Sensor, as_table(Sensor)]
 
 
@@ -49,7 +49,7 @@ class MethodFigures(Figures):
 class PipelineRecord(Figures):
     """WORK/pipeline.json: what the pipeline did, in the order of the work; `methods` by name."""
 
-    format_version: Literal[1] = 1
+    format_version: Literal[1]
     stages: tuple[StageFigures, ...]
     methods: dict[str, MethodFigures]
     capture: dict[str, Any]

@@ -113,9 +113,12 @@ def diffusion(obj: TwinObject, laser: int, cells: int = CELLS) -> Diffusion:
             values.append(-link)
             # Half a cell of diffusion in series with the surface's leak.
             diagonal[~both] += cell**2 / (cell / (2 * d[~both]) + 1 / leak)
-    matrix = sparse.coo_array(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(len(d), len(d))
-    ).tocsc() + sparse.diags_array(diagonal).tocsc()
+    matrix = (
+        sparse.coo_array(
+            (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(len(d), len(d))
+        ).tocsc()
+        + sparse.diags_array(diagonal).tocsc()
+    )
     options = {"SymmetricMode": True}
     factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
     nearest = ndimage.distance_transform_edt(~filled, return_indices=True, return_distances=False)

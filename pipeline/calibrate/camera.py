@@ -7,6 +7,7 @@ Conventions: the camera looks along +z of its own frame, x right, y down. Pixel 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -107,11 +108,25 @@ class PinholeCamera:
         return out
 
     def project(self, points: F64) -> tuple[F64, F64]:
-        """(N, 3) points of the frame -> (N, 2) pixel coordinates (x, y) and (N,) depth along +z in mm."""
+        """(N, 3) points of the frame -> (N, 2) pixel coordinates (x, y) and (N,) depth along +z in mm.
+
+        NaN for points far outside the picture that the distortion's polynomial would fold back into it.
+        """
         local = points @ self.pose[:3, :3].T + self.pose[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             xy = local[:, :2] / local[:, 2:]
-        return self.distort(xy) * self.focal + self.centre, local[:, 2]
+        pixels = self.distort(xy) * self.focal + self.centre
+        if any(self.distortion):
+            outside = np.linalg.norm(xy, axis=1) > 1.1 * self._reach
+            inside = ((pixels >= 0) & (pixels <= [self.width, self.height])).all(axis=1)
+            pixels[outside & inside] = np.nan
+        return pixels, local[:, 2]
+
+    @cached_property
+    def _reach(self) -> float:
+        """Of the picture's farthest corner, as the tangent of its angle off the axis."""
+        corners = np.array([[0, 0], [self.width, 0], [0, self.height], [self.width, self.height]], float)
+        return float(np.linalg.norm(self.undistort((corners - self.centre) / self.focal), axis=1).max())
 
     def rays(self, pixels: F64) -> tuple[F64, F64]:
         """(N, 2) pixel coordinates (x, y) -> (N, 3) origins and unit directions in the frame."""

@@ -83,8 +83,11 @@ def import_capture(folder: Path, out: Path, progress: Callable[[int, int], None]
     )
     with StreamWriter(out, plan) as stream:
         replace_file(out / "scan.ply", _scan(described.scan))
-        replace_file(out / "rig.json", RigFile(rig=described.rig).model_dump_json(indent=1).encode())
-        replace_file(out / "sensor.json", SensorFile(sensor=described.sensor).model_dump_json(indent=1).encode())
+        replace_file(out / "rig.json", RigFile(format_version=1, rig=described.rig).model_dump_json(indent=1).encode())
+        replace_file(
+            out / "sensor.json",
+            SensorFile(format_version=1, sensor=described.sensor).model_dump_json(indent=1).encode(),
+        )
         for index in range(len(stream), len(plan)):
             address = plan.address(index)
             frames = brackets[_key(plan, address)]

@@ -11,7 +11,7 @@ from pipeline.reconstruct.completion import measured_entries
 from pipeline.reconstruct.distances import Kernel
 from pipeline.reconstruct.mesh import vertex_areas
 from pipeline.reconstruct.model import ReflectanceModel
-from pipeline.reconstruct.profile import Measured
+from pipeline.reconstruct.profile import over_directions
 from pipeline.reconstruct.samples import Samples
 
 F64 = NDArray[np.float64]
@@ -44,7 +44,7 @@ def _kernel(scattering: float, absorption: float, eta: float) -> Kernel:
 
 def fit_dipole_laser(samples: Samples, laser: int) -> tuple[float, float]:
     """(sigma_s', sigma_a) in 1/mm: logarithms of linear means over bins of distance, and of the observed total."""
-    pairs, measured = samples.spot_pairs, Measured.of(samples, laser)
+    pairs, (measured, _) = samples.spot_pairs, over_directions(samples, laser)
     edge = float(samples.mesh.edges_unique_length.mean())
     bin_of = np.minimum((pairs.distance / (0.5 * edge)).astype(int), BINS)
     area = np.broadcast_to(vertex_areas(samples.mesh), bin_of.shape)

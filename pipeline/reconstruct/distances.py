@@ -119,7 +119,7 @@ def lit_hats(mesh: trimesh.Trimesh, spots: Spots) -> sparse.csr_array:
 
 def _pairs(mesh: trimesh.Trimesh, centres: F64, patches: list[tuple[F64, F64]], spread: float) -> Pairs:
     """Patches are (points, weights); weights add up to 1."""
-    edge = float(mesh.edges_unique_length.mean())
+    edge, longest = float(mesh.edges_unique_length.mean()), float(mesh.edges_unique_length.max())
     width, reach = edge / BINS_PER_EDGE, REACH * edge
     bins = int(np.ceil((reach + 4 * mesh.edges_unique_length.max()) / width))
     parts = hat_points(mesh, 4)
@@ -130,7 +130,7 @@ def _pairs(mesh: trimesh.Trimesh, centres: F64, patches: list[tuple[F64, F64]], 
         near = np.flatnonzero(distance[i] < reach)
         local = np.full(len(mesh.vertices), -1)
         local[near] = np.arange(len(near))
-        candidates = np.array(tree.query_ball_point(centres[i], reach + 1.5 * edge))
+        candidates = np.array(tree.query_ball_point(centres[i], reach + 1.05 * longest))
         vertex = local[parts.vertices[candidates]]
         column, corner = np.nonzero(vertex >= 0)
         vertex, weight = vertex[column, corner], parts.weights[candidates][column, corner]

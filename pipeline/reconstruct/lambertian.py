@@ -10,7 +10,7 @@ from pipeline.reconstruct.completion import MOST_HARMONICS, RANGE_EDGES, measure
 from pipeline.reconstruct.harmonics import harmonics
 from pipeline.reconstruct.mesh import interpolation, vertex_areas
 from pipeline.reconstruct.model import ReflectanceModel
-from pipeline.reconstruct.profile import Measured, fit_profile
+from pipeline.reconstruct.profile import over_directions
 from pipeline.reconstruct.samples import Samples
 
 F64 = NDArray[np.float64]
@@ -23,8 +23,8 @@ def spot_energies(samples: Samples, laser: int) -> F64:
 
     What the cameras did not see of a spot is added in the proportion of the radial profile.
     """
-    pairs, measured = samples.spot_pairs, Measured.of(samples, laser)
-    kernel = pairs.mean(fit_profile(pairs, measured, float(samples.mesh.edges_unique_length.mean()), samples.tilt)[0])
+    measured, profile = over_directions(samples, laser)
+    kernel = samples.spot_pairs.mean(profile)
     area = vertex_areas(samples.mesh)
     expected = (np.where(measured.observed, kernel, 0.0) * area).sum(axis=1)
     seen = (measured.value * area).sum(axis=1)

@@ -8,7 +8,7 @@ McCullagh & Nelder 1989, ch. 9), which averages noise linearly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,3 +169,14 @@ def fit_profile(
         if np.abs(step).max() < ENOUGH:
             break
     return profile, Tilt(edge, slopes)
+
+
+def over_directions(samples: Samples, laser: int) -> tuple[Measured, Profile]:
+    """One laser's samples with the direction's factor taken out, and the profile: what the simple models are fitted to.
+
+    They know nothing of directions; a mean over those that the cameras happened to look from would be too low.
+    """
+    measured = Measured.of(samples, laser)
+    edge = float(samples.mesh.edges_unique_length.mean())
+    profile, tilt = fit_profile(samples.spot_pairs, measured, edge, samples.tilt)
+    return replace(measured, value=measured.value * np.exp(-tilt(samples.spot_pairs.distance) * samples.tilt)), profile

@@ -90,7 +90,7 @@ def write_capture(folder: Path, subdivisions: int = 2) -> trimesh.Trimesh:
             meta = ImageMeta(n / 15, power, angle, aim.u if aim else -1, aim.v if aim else -1)
             stream.append(address, raw, meta)
     mesh.export(folder / "scan.ply")
-    (folder / "rig.json").write_text(RigFile(rig=config).model_dump_json())
-    (folder / "sensor.json").write_text(SensorFile(sensor=SENSOR).model_dump_json())
+    (folder / "rig.json").write_text(RigFile(format_version=1, rig=config).model_dump_json())
+    (folder / "sensor.json").write_text(SensorFile(format_version=1, sensor=SENSOR).model_dump_json())
     assert (first_hit(mesh, *calibration.spot_rays(plan.spots)).triangle >= 0).all()
     return mesh

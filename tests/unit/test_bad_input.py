@@ -227,7 +227,7 @@ def test_a_model_that_does_not_belong_to_what_is_scored(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     folder.work.mkdir()
     figures = MethodFigures(seconds=1.0, provenance={})
-    made = PipelineRecord(stages=(), methods={"default": figures}, capture={}, left_out=(), warnings=())
+    made = PipelineRecord(format_version=1, stages=(), methods={"default": figures}, capture={}, left_out=(), warnings=())
     (folder.work / "pipeline.json").write_text(made.model_dump_json())
     write_request = folder.work / "request.json"
     write_request.write_text(_json(pipeline_inputs(scene, ("default",))))

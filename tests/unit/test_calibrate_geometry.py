@@ -158,3 +158,17 @@ def test_projector_centre_and_span() -> None:
     aim = -np.array([590.0, 60, 110])
     np.testing.assert_allclose(directions[0], aim / np.linalg.norm(aim), atol=1e-12)
     assert np.degrees(np.arccos(directions[1] @ directions[2])) == pytest.approx(6)
+
+
+def test_points_far_outside_do_not_fold_back_into_the_picture() -> None:
+    """Rationale: r (1 - .3 r^2) turns back at r = 1.05; 61 degrees off the axis it lands inside the picture again."""
+    config = CameraConfig(
+        name="wide", position_mm=(0.0, -500.0, 0.0), width=192, height=124, focal_length_mm=60.0, pixel_pitch_um=44.0,
+        distortion=(-0.3, 0.0, 0.0, 0.0, 0.0),
+    )  # fmt: skip
+    camera = PinholeCamera.from_config(config)
+    local = np.array([[0.01, 0.005, 1.0], [np.tan(np.deg2rad(61.0)), 0.0, 1.0]])
+    points = (local * 300 - camera.pose[:3, 3]) @ camera.pose[:3, :3]
+    pixels, _ = camera.project(points)
+    assert np.isfinite(pixels[0]).all()
+    assert np.isnan(pixels[1]).all()

@@ -286,6 +286,17 @@ def test_lambertian_albedo_is_the_energy_of_the_spots(small) -> None:  # type: i
     assert albedo.mean() == pytest.approx(truth.mean(), rel=0.03)
 
 
+def test_baselines_are_not_misled_by_the_views(small) -> None:  # type: ignore[no-untyped-def]
+    """Rationale: samples darker by the direction that they were seen from; dipole and Lambertian fits see through it."""
+    s = make(spots=60, noise=0.0, contrast=0.0).samples
+    tilt = np.random.default_rng(4).uniform(-0.8, 0.2, s.values[0].shape)
+    leaning = replace(s, tilt=tilt, values=s.values * np.exp(0.5 * tilt).astype(np.float32))
+    np.testing.assert_allclose(
+        fit_lambertian(leaning).reflectance.sum(), fit_lambertian(s).reflectance.sum(), rtol=0.02
+    )
+    np.testing.assert_allclose(fit_dipole_laser(leaning, 0), fit_dipole_laser(s, 0), rtol=0.05)
+
+
 def test_2004_spots_count_for_their_triangles(small) -> None:  # type: ignore[no-untyped-def]
     s = small.samples
     one = replace(s, values=np.where(np.arange(80)[:, None] == 5, s.values, np.nan).astype(np.float32))

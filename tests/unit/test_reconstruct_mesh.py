@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 
+from pipeline.calibrate.camera import PinholeCamera
 from pipeline.reconstruct.distances import hat_points, spot_pairs, vertex_pairs
 from pipeline.reconstruct.harmonics import harmonics
 from pipeline.reconstruct.mesh import first_hit, stiffness, vertex_areas
 from pipeline.reconstruct.spots import Spots
+from pipeline.reconstruct.views import footprint_reading, see_surface
+from pipeline.rig import CameraConfig
 
 
 def plane(n: int = 24, edge: float = 1.0) -> trimesh.Trimesh:
@@ -122,3 +125,42 @@ def test_an_oblique_beam_is_longer() -> None:
     hat = 2 / 8
     assert (a - hat) == pytest.approx(2.0, rel=0.08)  # r^2 / 2
     assert (b - hat) == pytest.approx(5.0, rel=0.08)  # r^2 / 4 (1 + 1 / cos^2)
+
+
+def wide_camera(position: tuple[float, float, float], focal_length_mm: float) -> PinholeCamera:
+    return PinholeCamera.from_config(
+        CameraConfig(
+            name="it", position_mm=position, width=96, height=80, focal_length_mm=focal_length_mm, pixel_pitch_um=100.0
+        )
+    )
+
+
+def test_area_that_a_wide_angle_sees_is_the_surface_s() -> None:
+    """Rationale: pixels at the rim of a wide picture span less solid angle (cos^3); the areas of hats seen in full must
+    still come out right, or their share of the vertex would not be 1.
+    """
+    plate = trimesh.creation.box((60.0, 1.0, 60.0)).subdivide_to_size(6.0)
+    reading = footprint_reading(plate, wide_camera((0.0, -40.0, 0.0), 4.5), 1.3, 75.0)
+    front = np.abs(plate.vertices[:, 1] + 0.5) < 1e-6
+    inside = front & (np.abs(plate.vertices[:, [0, 2]]).max(axis=1) < 22)
+    assert np.abs(plate.vertices[inside][:, 0]).max() > 15  # 20 degrees and more off the axis
+    pixels = see_surface(plate, wide_camera((0.0, -40.0, 0.0), 4.5), 75.0)
+    area = np.bincount(
+        pixels.vertices.ravel(), (pixels.area[:, None] * pixels.barycentric).ravel(), len(plate.vertices)
+    )
+    np.testing.assert_allclose(area[inside], vertex_areas(plate)[inside], rtol=0.05)
+    assert (reading.share[inside] > 0.95).all()
+
+
+def test_nothing_is_read_across_an_edge_of_depth() -> None:
+    """Rationale: a small sphere before a large one; pixels on its outline mix both, and are read for neither."""
+    near = trimesh.creation.icosphere(subdivisions=3, radius=5.0).apply_translation((0.0, -30.0, 0.0))
+    scan = trimesh.util.concatenate([trimesh.creation.icosphere(subdivisions=3, radius=15.0), near])
+    camera = wide_camera((0.0, -200.0, 0.0), 38.0)
+    read = np.unique(see_surface(scan, camera, 80.0).pixel)
+    direction = camera.rays(camera.pixel_centres())[1]
+    off_axis = np.linalg.norm(np.cross(direction, [0.0, 1.0, 0.0]), axis=1)
+    rim = np.abs(off_axis - 5.0 / 170.0) < 0.5 * 0.1 / 38.0  # within half a pixel of the small sphere's outline
+    assert rim.sum() > 20
+    assert not np.isin(np.flatnonzero(rim), read).any()
+    assert np.isin(np.flatnonzero(off_axis < 0.5 * 5.0 / 170.0), read).all()

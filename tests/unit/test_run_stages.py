@@ -51,7 +51,7 @@ def keys_of(folder: RunFolder, methods: tuple[str, ...] = ("default",)) -> dict[
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
-    done = PipelineRecord(stages=(), methods={}, capture={}, left_out=(), warnings=())
+    done = PipelineRecord(format_version=1, stages=(), methods={}, capture={}, left_out=(), warnings=())
     monkeypatch.setattr(stages, "load_results", lambda folder: done)
     monkeypatch.setattr(stages, "stale", lambda *_: None)
     scene = tmp_path / "scene.toml"
