@@ -19,12 +19,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from hw.errors import DiscoError, InputError
+from pipeline.capture.files import IMAGES, JOURNAL
 from pipeline.config import Strict, as_table, read_json
 from pipeline.resources import measured
 
 log = logging.getLogger(__name__)
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 FOLDERS = ("capture", "twin", "work")
 
 
@@ -32,7 +33,7 @@ FOLDERS = ("capture", "twin", "work")
 class StageRecord:
     """A stage's inputs as a key, and what it took. Seconds add up over interruptions; the peak is the largest.
 
-    outputs: size in bytes of each file that the finished stage left, by its path in the run folder.
+    outputs: BLAKE2 digest of each file that the finished stage left, by its path in the run folder.
     """
 
     name: str
@@ -40,11 +41,14 @@ class StageRecord:
     seconds: float = 0.0
     peak_mb: float = 0.0
     finished: bool = False
-    outputs: dict[str, int] = field(default_factory=dict)
+    outputs: dict[str, str] = field(default_factory=dict)
 
-    def intact(self, root: Path) -> bool:
-        """Whether the files are still there, of the same size."""
-        return all((root / p).is_file() and (root / p).stat().st_size == size for p, size in self.outputs.items())
+    def damaged(self, root: Path) -> str | None:
+        """The first of the files that is no longer what the stage left; None if all are."""
+        for path, digest in self.outputs.items():
+            if not (root / path).is_file() or file_digest(root / path) != digest:
+                return path
+        return None
 
 
 @dataclass
@@ -109,7 +113,7 @@ class RunFolder:
         if root.exists() and not root.is_dir():
             raise InputError("is not a folder", file=root, remedy="choose another --out")
         if folder.journal.is_file():
-            folder._load()
+            folder._load_or_begin_anew(identity)
             if folder.identity != identity:
                 raise InputError(
                     "the folder holds the run of another scene or profile, or the scene has changed since",
@@ -137,9 +141,10 @@ class RunFolder:
                 self._load()  # another process may have worked here since
             record = self.stages.get(name)
             if record is not None and record.key == key and record.finished:
-                if record.intact(self.root):
+                path = record.damaged(self.root)
+                if path is None:
                     return False
-                log.warning("%s: a file is missing or cut, the stage is done again", name)
+                log.warning("%s: %s is missing or damaged, the stage is done again", name, path)
                 record = None
             if record is None or record.key != key:
                 record = StageRecord(name, key)
@@ -157,7 +162,7 @@ class RunFolder:
                 child = work()
             record.finished = True
             files = [path for pattern in outputs for path in self.root.glob(pattern) if path.is_file()]
-            record.outputs = {str(path.relative_to(self.root)): path.stat().st_size for path in files}
+            record.outputs = {str(path.relative_to(self.root)): file_digest(path) for path in files}
         finally:
             if usage is not None:
                 record.seconds += usage.seconds
@@ -184,6 +189,21 @@ class RunFolder:
         self.identity = data.identity
         self.stages = {record.name: record for record in data.stages}
 
+    def _load_or_begin_anew(self, identity: str) -> None:
+        """A journal that cannot be read is begun anew: what stages left is looked at again, nothing is lost.
+
+        Light that other code or another scene made is known by its own key (twin/light.key).
+        """
+        try:
+            self._load()
+        except InputError as error:
+            if _of_another_version(self.journal):
+                raise
+            kept = self.journal.with_suffix(".damaged")
+            log.warning("%s; it is kept as %s, and every stage is looked at again", error, kept.name)
+            self.journal.replace(kept)
+            self.identity = identity
+
     def _save(self) -> None:
         data = {
             "format_version": FORMAT_VERSION,
@@ -196,9 +216,25 @@ class RunFolder:
 class _Journal(Strict):
     """stages.json."""
 
-    format_version: Literal[1]
+    format_version: Literal[2]
     identity: str
     stages: tuple[Annotated[StageRecord, as_table(StageRecord)], ...]
+
+
+def _of_another_version(journal: Path) -> bool:
+    """Whether the journal can be read, and says that other code wrote it."""
+    try:
+        return json.loads(journal.read_bytes()).get("format_version", FORMAT_VERSION) != FORMAT_VERSION
+    except (ValueError, AttributeError):
+        return False
+
+
+def file_digest(path: Path) -> str:
+    """BLAKE2 of a file's content; of the stream the size, since each of its images has a checksum of its own."""
+    if path.name in (IMAGES, JOURNAL):
+        return f"{path.stat().st_size} bytes"
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, hashlib.blake2b).hexdigest()
 
 
 def _barely_begun(root: Path) -> bool:

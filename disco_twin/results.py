@@ -121,7 +121,7 @@ def comparisons(
                     light.name,
                     view.name,
                     reference.mean(axis=0),
-                    {m: load_relit(folder, m, light.name, view.name) for m in methods},
+                    {m: load_relit(folder, m, light.name, view) for m in methods},
                     world.object_mask(view),
                     mm_per_pixel(view),
                     {r["method"]: r["nrmse"] for r in rows if r["nrmse"] is not None},

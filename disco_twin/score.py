@@ -21,6 +21,7 @@ from pipeline.config import Strict, read_json
 
 if TYPE_CHECKING:
     from pipeline.reconstruct.model import ReflectanceModel
+    from pipeline.rig import CameraConfig
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +70,7 @@ def score_relit_images(world: World, folder: RunFolder, methods: Sequence[str]) 
         for view in world.scene.relight.views:
             a, b = load_reference(reference_path(folder.twin / "references", light, view)).halves[:, layer]
             for method in methods:
-                image = load_relit(folder, method, light.name, view.name)
+                image = load_relit(folder, method, light.name, view)
                 row = {"light": light.name, "view": view.name, "method": method}
                 rows.append(row | usable_score(" ".join(row.values()), image, a, b, masks[view.name]))
     return rows
@@ -89,16 +90,26 @@ def usable_score(what: str, image: F32, a: F32, b: F32, mask: NDArray[np.bool_])
     return {k: score[k] for k in KEPT}
 
 
-def load_relit(folder: RunFolder, method: str, light: str, view: str) -> F32:
+def load_relit(folder: RunFolder, method: str, light: str, view: CameraConfig) -> F32:
     """(L, H, W) relit image in W/(mm^2 sr)."""
-    path = folder.work / "relit" / method / f"{light}@{view}.npy"
+    path = folder.work / "relit" / method / f"{light}@{view.name}.npy"
     if not path.is_file():
         raise InputError("is missing", file=path, remedy=f"disco-twin reconstruct --out {folder.root}")
+    remedy = f"delete it, then disco-twin reconstruct --out {folder.root}"
     try:
-        return np.asarray(np.load(path, allow_pickle=False))
+        image = np.asarray(np.load(path, allow_pickle=False))
     except (OSError, ValueError, EOFError, SyntaxError) as error:
-        remedy = f"delete it, then disco-twin reconstruct --out {folder.root}"
         raise InputError("is damaged", file=path, remedy=remedy) from error
+    size = (view.height, view.width)
+    if image.ndim != 3 or image.shape[1:] != size or image.dtype.kind != "f":
+        raise InputError(
+            "is no image of this view",
+            file=path,
+            value=image.shape,
+            allowed=f"(lasers, {size[0]}, {size[1]})",
+            remedy=remedy,
+        )
+    return image
 
 
 def load_model(folder: RunFolder, method: str) -> ReflectanceModel | None:

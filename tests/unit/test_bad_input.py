@@ -30,6 +30,7 @@ from hw.errors import InputError, naming
 from pipeline.config import read_json
 from pipeline.lens import covers_image
 from pipeline.records import MethodFigures, PipelineRecord, RigFile
+from pipeline.rig import CameraConfig
 
 
 def one_line(caught: pytest.ExceptionInfo[InputError], *parts: str) -> None:
@@ -193,10 +194,15 @@ def test_damaged_arrays(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     file = folder.work / "relit" / "default" / "l@v.npy"
     file.parent.mkdir(parents=True)
+    view = CameraConfig(name="v", position_mm=(400.0, 0.0, 0.0), width=64, height=48)
     file.write_bytes(b"\x80garbage")
     with pytest.raises(InputError) as caught:
-        load_relit(folder, "default", "l", "v")
+        load_relit(folder, "default", "l", view)
     one_line(caught, str(file), "reconstruct")
+    np.save(file, np.zeros((3, 4, 4), np.float32))
+    with pytest.raises(InputError) as caught:
+        load_relit(folder, "default", "l", view)
+    one_line(caught, str(file), "(3, 4, 4)", "(lasers, 48, 64)", "reconstruct")
     truth = tmp_path / "truth.npz"
     for content in (b"", b"\x80garbage", b"PK\x03\x04" + bytes(40)):
         truth.write_bytes(content)
@@ -227,7 +233,8 @@ def test_a_model_that_does_not_belong_to_what_is_scored(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     folder.work.mkdir()
     figures = MethodFigures(seconds=1.0, provenance={})
-    made = PipelineRecord(format_version=1, stages=(), methods={"default": figures}, capture={}, left_out=(), warnings=())
+    methods = {"default": figures}
+    made = PipelineRecord(format_version=1, stages=(), methods=methods, capture={}, left_out=(), warnings=())
     (folder.work / "pipeline.json").write_text(made.model_dump_json())
     write_request = folder.work / "request.json"
     write_request.write_text(_json(pipeline_inputs(scene, ("default",))))

@@ -287,7 +287,7 @@ def test_lambertian_albedo_is_the_energy_of_the_spots(small) -> None:  # type: i
 
 
 def test_baselines_are_not_misled_by_the_views(small) -> None:  # type: ignore[no-untyped-def]
-    """Rationale: samples darker by the direction that they were seen from; dipole and Lambertian fits see through it."""
+    """Rationale: samples darker by the direction that they were seen from; the fits see through it."""
     s = make(spots=60, noise=0.0, contrast=0.0).samples
     tilt = np.random.default_rng(4).uniform(-0.8, 0.2, s.values[0].shape)
     leaning = replace(s, tilt=tilt, values=s.values * np.exp(0.5 * tilt).astype(np.float32))

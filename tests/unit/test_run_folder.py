@@ -109,3 +109,35 @@ def test_a_stage_whose_file_is_missing_or_cut_is_done_again(tmp_path: Path, dama
         made.write_bytes(b"01234")
     assert folder.run("truth", "k", work, ["twin/*.npz"])
     assert made.read_bytes() == b"0123456789"
+
+
+def test_a_flipped_bit_in_a_finished_stage_does_it_again(tmp_path: Path) -> None:
+    folder, made = RunFolder(tmp_path), tmp_path / "work" / "made.npy"
+    made.parent.mkdir()
+
+    def work() -> None:
+        made.write_bytes(b"0123456789")
+
+    assert folder.run("stage", "k", work, ("work/*.npy",))
+    assert not folder.run("stage", "k", work, ("work/*.npy",))
+    made.write_bytes(b"0123456788")
+    assert folder.run("stage", "k", work, ("work/*.npy",))
+    assert made.read_bytes() == b"0123456789"
+
+
+def test_a_damaged_journal_loses_nothing(tmp_path: Path, scene: Path) -> None:
+    """Expected behaviour: it is set aside, what lies in the folder stays, and the stages are looked at again; one that
+    another version wrote is refused and left alone.
+    """
+    folder = RunFolder.claim(tmp_path / "out", scene, "one")
+    (folder.capture / "images.bin").write_bytes(b"hours of work")
+    folder.journal.write_bytes(b"\x00" + folder.journal.read_bytes()[1:])
+    again = RunFolder.claim(tmp_path / "out", scene, "one")
+    assert (again.capture / "images.bin").read_bytes() == b"hours of work"
+    assert again.journal.with_suffix(".damaged").is_file()
+    assert again.run("stage", "k", lambda: None)
+    newer = '{"format_version": 99, "identity": "one", "stages": []}'
+    again.journal.write_text(newer)
+    with pytest.raises(InputError, match="format_version"):
+        RunFolder.claim(tmp_path / "out", scene, "one")
+    assert again.journal.read_text() == newer
