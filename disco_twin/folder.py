@@ -224,7 +224,7 @@ class _Journal(Strict):
 def _of_another_version(journal: Path) -> bool:
     """Whether the journal can be read, and says that other code wrote it."""
     try:
-        return json.loads(journal.read_bytes()).get("format_version", FORMAT_VERSION) != FORMAT_VERSION
+        return bool(json.loads(journal.read_bytes()).get("format_version", FORMAT_VERSION) != FORMAT_VERSION)
     except (ValueError, AttributeError):
         return False
 

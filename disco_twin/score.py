@@ -100,15 +100,9 @@ def load_relit(folder: RunFolder, method: str, light: str, view: CameraConfig) -
         image = np.asarray(np.load(path, allow_pickle=False))
     except (OSError, ValueError, EOFError, SyntaxError) as error:
         raise InputError("is damaged", file=path, remedy=remedy) from error
-    size = (view.height, view.width)
-    if image.ndim != 3 or image.shape[1:] != size or image.dtype.kind != "f":
-        raise InputError(
-            "is no image of this view",
-            file=path,
-            value=image.shape,
-            allowed=f"(lasers, {size[0]}, {size[1]})",
-            remedy=remedy,
-        )
+    if image.ndim != 3 or image.shape[1:] != (view.height, view.width) or image.dtype.kind != "f":
+        allowed = f"(lasers, {view.height}, {view.width})"
+        raise InputError(f"is no image of this view but of {image.shape}", file=path, allowed=allowed, remedy=remedy)
     return image
 
 
