@@ -364,6 +364,7 @@ class AdcPhotodiode:
 
     def read(self) -> float:
         """Watts on the object; refused when they are not those that the laser was set to."""
+        self.rig.devices()
         laser = self.rig.last_open
         if laser < 0:
             return 0.0

@@ -54,9 +54,11 @@ def test_the_set_point_scales_the_light() -> None:
 def test_a_camera_in_front_of_moving_things_refuses(emulated: Emulation) -> None:
     bench = emulated.bench
     with emulated.serial_rig() as rig:
+        bench.board.set_pattern(0b1)
         bench.board.galvos[0].aim(0, emulated.clock.now() + 0.05)
         with pytest.raises(DiscoError, match="mirrors moving"):
             rig.cameras[0].expose()
+        bench.board.set_pattern(0)
         emulated.clock.sleep(1.0)
         bench.spindle.go(180.0, emulated.clock.now())
         with pytest.raises(DiscoError, match="no light for a turntable at"):
