@@ -66,6 +66,10 @@ class Unplugged(DeviceError):
     """The port cannot be opened, read or written."""
 
 
+class SwitchedOff(Unplugged):
+    """The guard of a laser's port has closed it: it is switching the laser off, or lost the port itself."""
+
+
 class WrongDevice(DeviceError):
     """Another device than the expected one is at this port."""
 

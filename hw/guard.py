@@ -55,6 +55,10 @@ class Program:
         return "its program was told to end" if ENDING.intersection(seen) else None
 
 
+class GuardClosed(serial.SerialException):
+    """The program's end of a guarded port is closed: the guard is switching the laser off, or lost its port."""
+
+
 class _Stop(Exception):
     """The guard itself is told to end."""
 

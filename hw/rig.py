@@ -16,7 +16,7 @@ from typing import Protocol, Self, TypeVar
 from hw.clock import Clock
 from hw.devices.mm_ard import ADC_TOP
 from hw.devices.turning import Table
-from hw.errors import DeviceFault, DiscoError, Refused
+from hw.errors import DeviceFault, DiscoError, Refused, SwitchedOff
 from hw.interface import Aim, Camera, Floodlight, Laser, Photodiode, Projector, Turntable
 
 log = logging.getLogger(__name__)
@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 HEARD_S = 0.02  # until what was told without waiting for an answer has been understood
 ATTEMPTS = 3
-PROMPT_S = 0.1  # lines and mirrors are set in a few milliseconds; a reply that is waited for in vain takes longer
+PROMPT_S = 0.15  # answers take a few milliseconds on an idle computer; a repeated question takes 200 or more
 SETTLE_S = 0.005  # of the galvos, after the DAC has taken both values
 
 
@@ -195,6 +195,8 @@ class SerialRig:
         for step in steps:
             try:
                 step()
+            except SwitchedOff as error:
+                log.info("making the rig safe: %s", error)  # its guard was faster, and speaks up if it fails
             except DiscoError as error:
                 log.error("making the rig safe: %s", error)
 
@@ -244,7 +246,7 @@ class SerialRig:
         begun = self.clock.now()
         answer = question(self.devices().board)
         if self.clock.now() - begun > PROMPT_S:
-            log.warning("the mirror board was slow to answer: the mirrors will be aimed anew")
+            log.info("the mirror board was slow to answer: the mirrors will be aimed anew")
             self._aimed = False
         return answer
 

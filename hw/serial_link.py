@@ -15,7 +15,8 @@ import serial
 
 from hw.bytelog import ByteLog
 from hw.clock import Clock
-from hw.errors import Garbled, NoAnswer, Unplugged
+from hw.errors import Garbled, NoAnswer, SwitchedOff, Unplugged
+from hw.guard import GuardClosed
 
 log = logging.getLogger(__name__)
 
@@ -123,7 +124,8 @@ class Link:
             self._log.note(self.clock.now(), mark, data)
 
     def _lost(self, what: str, error: Exception) -> Unplugged:
-        return Unplugged(self.url, f"the port of {self.device}", f"{what} ({error})", REMEDY)
+        kind = SwitchedOff if isinstance(error, GuardClosed) else Unplugged
+        return kind(self.url, f"the port of {self.device}", f"{what} ({error})", REMEDY)
 
 
 class Inbox(Generic[M]):

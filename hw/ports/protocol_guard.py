@@ -24,7 +24,7 @@ from pathlib import Path
 from serial import PortNotOpenError, SerialBase, SerialException, SerialTimeoutException
 
 import hw
-from hw.guard import READY
+from hw.guard import READY, GuardClosed
 
 log = logging.getLogger(__name__)
 
@@ -141,9 +141,9 @@ class Serial(SerialBase):
                 return b""
             data = host.recv(size)
         except OSError as error:
-            raise SerialException(str(error)) from error
+            raise GuardClosed(f"its guard has closed it: {error.strerror}") from error
         if not data:
-            raise SerialException("the guard has closed it: the device was unplugged, or the laser switched off")
+            raise GuardClosed("its guard has closed it: the laser was switched off, or its cable pulled")
         return data
 
     def write(self, data: bytes, /) -> int:  # type: ignore[override]
@@ -155,7 +155,7 @@ class Serial(SerialBase):
         except TimeoutError as error:
             raise SerialTimeoutException("the guard takes no bytes") from error
         except OSError as error:
-            raise SerialException(f"the guard has closed it ({error.strerror})") from error
+            raise GuardClosed(f"its guard has closed it: {error.strerror}") from error
         return len(data)
 
     def reset_input_buffer(self) -> None:

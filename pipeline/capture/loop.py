@@ -64,8 +64,10 @@ def capture(
                     with rig:
                         _restore(rig, stream, sensor)
                         _sweep(rig, stream, signals, progress)
-                except KeyboardInterrupt:
-                    raise _interrupted(stream) from None
+                except (KeyboardInterrupt, DiscoError):
+                    if signals.stopped:  # what fails on the way out does not matter any more
+                        raise _interrupted(stream) from None
+                    raise
                 finally:
                     signals.ignore()
                     rig.make_safe()  # once more: entering the rig may have failed half-way, leaving it been interrupted
@@ -156,7 +158,7 @@ class _Signals:
 
     def __init__(self) -> None:
         self._before: dict[signal.Signals, signal._HANDLER] = {}
-        self._holding = self._asked = self._ignoring = False
+        self._holding = self._asked = self._ignoring = self.stopped = False
 
     def __enter__(self) -> _Signals:
         if threading.current_thread() is threading.main_thread():
@@ -176,7 +178,7 @@ class _Signals:
             self._stop()
 
     def _stop(self) -> None:
-        self._ignoring = True
+        self._ignoring = self.stopped = True
         raise KeyboardInterrupt
 
     def ignore(self) -> None:

@@ -162,6 +162,27 @@ def test_a_signal_while_the_rig_works_ahead_is_obeyed_at_once(tmp_path: Path) ->
         capture(Slow(PLAN), PLAN, tmp_path)
 
 
+def test_a_device_that_fails_on_the_way_out_does_not_hide_the_signal(tmp_path: Path) -> None:
+    """The guard of a laser closes its port at the signal, and then nobody can talk to the laser any more."""
+
+    class Guarded(FakeRig):
+        def __enter__(self) -> Guarded:
+            super().__enter__()
+            try:
+                os.kill(os.getpid(), signal.SIGTERM)
+            finally:
+                raise DiscoError("the laser's port is closed")
+
+    with pytest.raises(Interrupted, match="stopped: 0 of 48"):
+        capture(Guarded(PLAN), PLAN, tmp_path)
+    with pytest.raises(DiscoError, match="port is closed"):
+        capture(FakeRig(PLAN, on_expose=after(3, closed_port)), PLAN, tmp_path)
+
+
+def closed_port(rig: FakeRig) -> None:
+    raise DiscoError("the laser's port is closed")
+
+
 def test_signals_that_are_ignored_stay_ignored(tmp_path: Path) -> None:
     """nohup: the terminal's end does not end the capture."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
