@@ -8,7 +8,7 @@ adds the noise of the predictor, so what counts is to code every histogram as it
 2. The runs of one kind, in the order of the image, are coded by pcodec: adaptive bins, asymmetric numeral systems for
    the bin and plain bits within it. It also decides whether differences between neighbours are smaller. Large kinds
    are coded in pieces, so that cores can share an image.
-3. Exponents, which are rarely anything but zero, and the kinds are compressed by zstd.
+3. Exponents are zero in most runs; those of the others are compressed by zstd, with the kinds.
 
 Both libraries release Python's lock.
 """
@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import Executor
+from typing import TypeVar
 
 import numpy as np
 import zstandard
@@ -27,9 +28,11 @@ from hw.record import RawImage
 
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
+Pixel = TypeVar("Pixel", np.uint8, np.uint16)
 
 RUN = 32  # pixels
 PIECE = 2048  # runs that are coded together at most
+HALVED = np.uint8(128)  # added to a kind: the run has exponents other than zero
 QUIETEST = 3  # bits; telling still quieter runs apart would cost more than it saves
 ZSTD_LEVEL = 1
 # Levels and what is tried were chosen by measurement (decision 0040); a decoder needs neither.
@@ -48,17 +51,23 @@ def encode(raw: RawImage, pool: Executor | None = None) -> tuple[bytes, bytes]:
     kinds = _kinds(runs)
     sorted_runs = runs[_order(kinds)]
     pieces = coding(_encode_piece, [(kind, sorted_runs[piece]) for kind, piece in _pieces(kinds)])
-    exponents = zstandard.compress(raw.exponent.tobytes() + kinds.tobytes(), ZSTD_LEVEL)
+    exponents = _runs(raw.exponent)
+    words = exponents.view(np.uint64)
+    halved = np.bitwise_or.reduce(list(words.T)) != 0
+    described = (kinds | (halved * HALVED)).tobytes() + exponents[halved].tobytes()
     coded = list(pieces)
     lengths = np.array([len(piece) for piece in coded], "<u4")
-    return exponents, lengths.tobytes() + b"".join(coded)
+    return zstandard.compress(described, ZSTD_LEVEL), lengths.tobytes() + b"".join(coded)
 
 
 def decode(shape: tuple[int, int], exponents: bytes, charges: bytes) -> RawImage:
     """The record of `shape` (height, width) from the two results of `encode`."""
     size = shape[0] * shape[1]
-    plain = np.frombuffer(zstandard.decompress(exponents), np.uint8)
-    kinds = plain[size:]
+    described = np.frombuffer(zstandard.decompress(exponents), np.uint8)
+    count = -(-size // RUN)
+    kinds, halved = described[:count] & ~HALVED, described[:count] >= HALVED
+    exponent = np.zeros((count, RUN), np.uint8)
+    exponent[halved] = described[count:].reshape(-1, RUN)
     pieces = [piece for _, piece in _pieces(kinds)]
     ends = 4 * len(pieces) + np.cumsum(np.frombuffer(charges, "<u4", len(pieces)), dtype=np.int64)
     sorted_runs = np.empty((len(kinds), RUN), np.uint16)
@@ -66,17 +75,18 @@ def decode(shape: tuple[int, int], exponents: bytes, charges: bytes) -> RawImage
     for piece, end in zip(pieces, ends.tolist(), strict=True):
         standalone.simple_decompress_into(charges[start:end], sorted_runs[piece].reshape(-1))
         start = end
-    runs = np.empty_like(sorted_runs)
-    runs[_order(kinds)] = sorted_runs
-    return RawImage(plain[:size].reshape(shape), runs.reshape(-1)[:size].reshape(shape))
+    order = _order(kinds)
+    back = np.empty_like(order)
+    back[order] = np.arange(len(order))
+    charge = sorted_runs.take(back, axis=0).reshape(-1)[:size]
+    return RawImage(exponent.reshape(-1)[:size].reshape(shape), charge.reshape(shape))
 
 
-def _runs(charge: U16) -> U16:
+def _runs(image: NDArray[Pixel]) -> NDArray[Pixel]:
     """(n, RUN): the image's pixels row after row; the last one is repeated to fill the last run."""
-    flat = np.ascontiguousarray(charge).reshape(-1)
-    return (
-        np.pad(flat, (0, -flat.size % RUN), mode="edge").reshape(-1, RUN) if flat.size % RUN else flat.reshape(-1, RUN)
-    )
+    flat = np.ascontiguousarray(image).reshape(-1)
+    missing = -flat.size % RUN
+    return (np.pad(flat, (0, missing), mode="edge") if missing else flat).reshape(-1, RUN)
 
 
 def _kinds(runs: U16) -> U8:
