@@ -24,6 +24,7 @@ REGISTRY = {
     "irradiance": "benchmarks.irradiance",
     "laser-safety": "benchmarks.laser_safety",
     "pareto": "benchmarks.pareto",
+    "resample": "benchmarks.resample",
     "stream": "benchmarks.stream",
     "walk": "benchmarks.walk",
 }

@@ -10,13 +10,16 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from hw.interface import Aim
+
+if TYPE_CHECKING:
+    from disco_twin.world import World
 
 F32 = NDArray[np.float32]
 
@@ -44,8 +47,11 @@ class Interpolated:
         return np.asarray(np.maximum(light, 0.0) * (self.silhouette(camera, aim.angle) > 0), np.float32)
 
 
-def capture_frames(folder: Path, spots: int, walks: int) -> None:
-    """A whole capture of `spots` spots with `walks` photons each, into `folder / "capture"`."""
+def capture_frames(folder: Path, spots: int, walks: int, angles: int = 3, vertices: int | None = None) -> World:
+    """A whole capture of `spots` spots with `walks` photons each, into `folder / "capture"`; its world.
+
+    angles: of the turntable, evenly spaced; vertices: of the scan, about, if not the scene's
+    """
     from disco_twin.deviation import actual_rig
     from disco_twin.rig import TwinRig
     from disco_twin.scene import load_scene
@@ -60,9 +66,12 @@ def capture_frames(folder: Path, spots: int, walks: int) -> None:
         size = {"width": WIDTH // factor, "height": HEIGHT // factor, "pixel_pitch_um": 11.0 * factor}
         cameras = tuple(camera.model_copy(update=size) for camera in scene.rig.cameras)
         faults = scene.rig.faults.model_copy(update=lit)
-        return scene.rig.model_copy(update={"spots": spots, "cameras": cameras, "faults": faults})
+        turns = tuple(360.0 * j / angles for j in range(angles))
+        update = {"spots": spots, "cameras": cameras, "faults": faults, "turntable_angles_deg": turns}
+        return scene.rig.model_copy(update=update)
 
-    world = World(scene.model_copy(update={"rig": rig(1)}))
+    scan = scene.scan.model_copy(update={"vertices": vertices or scene.scan.vertices})
+    world = World(scene.model_copy(update={"rig": rig(1), "scan": scan}))
     transport = world.transport
     from disco_twin.light.response import SpotResponses
 
@@ -73,3 +82,4 @@ def capture_frames(folder: Path, spots: int, walks: int) -> None:
 
     twin = TwinRig(rig(1), Interpolated(responses(FACTOR), responses(1)), scene.seed)
     capture(twin, world.plan, folder / "capture")
+    return world

@@ -6,7 +6,6 @@ beam of power Phi; no foreshortening cosine, since the whole beam enters). So R_
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,29 +13,25 @@ from functools import cached_property
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy import ndimage, sparse
+from scipy import sparse
 
-from hw.record import RadianceImage
 from pipeline.calibrate.calibration import Calibration
 from pipeline.calibrate.camera import PinholeCamera
-from pipeline.capture.plan import ImageAddress, Plan
-from pipeline.capture.stream import CorruptImage, StreamReader
+from pipeline.capture.plan import Plan
+from pipeline.capture.stream import StreamReader
 from pipeline.reconstruct.distances import Pairs, lit_hats, spot_pairs, vertex_pairs
+from pipeline.reconstruct.resample import Part, Sight, Sums, look_up, resample
 from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.reconstruct.spots import Spots, locate_spots, outward_tilt
 from pipeline.reconstruct.views import Reading
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
+I64 = NDArray[np.int64]
 
-log = logging.getLogger(__name__)
-
-MIN_SHARE = 0.5  # of a vertex's hat that a camera must see
 # Relative scatter of samples of one entry that differ in direction: all of them, and what oblique ones add. Measured as
 # the spread about a completed quick scene within two edges of the spots (docs/decisions/0013).
 ANGULAR, OBLIQUE = 0.1, 0.5
-# Its response to white noise has the noise's variance, and none to a linear slope (Immerkaer 1996).
-NOISE_MASK = np.outer([1, -2, 1], [1, -2, 1]) / 6.0
 
 
 @dataclass(frozen=True)
@@ -111,40 +106,52 @@ def oblique_variance(cosine: NDArray[np.floating]) -> F64:
     return np.asarray(OBLIQUE**2 * (1.0 - np.clip(cosine, 0.0, 1.0)) ** 8, np.float64)
 
 
-def noise_squared(image: NDArray[np.floating]) -> F64:
-    """(H, W) local estimate of each pixel's noise variance from its 3 x 3 neighbourhood, exact on average."""
-    return np.asarray(ndimage.convolve(np.asarray(image, np.float64), NOISE_MASK, mode="nearest") ** 2)
-
-
 class _Gathered:
-    """Readings of all spots by all cameras: (L, S, C, V) arrays for one way of reading.
+    """Readings of all spots by all cameras, for one way of reading.
 
-    value in mm^-2; its variance in mm^-4: dark, without signal; noise, as the image shows; shot, by the camera's model
+    value: (L, S, C, V) mm^-2, NaN where not observed
+    scale: (L, S, C) pi / (F_t(w_i) Phi) of the images, 0 where one is missing
+    noise, shot: (L, views, V) mm^-4, variance summed over the values of a view: as the images show it, and by the
+        camera's model; dark: (L, views, V) variance of an image without signal, as of radiance / F_t
     """
 
     def __init__(self, lasers: int, plan: Plan, readings: list[Reading]) -> None:
-        cameras, vertices = len(plan.cameras), readings[0].operator.shape[0]
-        shape = (lasers, len(plan.spots), cameras, vertices)
+        cameras, vertices = len(plan.cameras), len(readings[0].share)
         self.readings, self.plan = readings, plan
-        self.squared = [r.operator.multiply(r.operator).tocsr() for r in readings]
-        self.touched = [abs(r.operator).tocsr() for r in readings]
-        self.value = np.full(shape, np.nan, np.float32)
-        self.dark = np.zeros(shape, np.float32)
-        self.noise = np.zeros(shape, np.float32)
-        self.shot = np.zeros(shape, np.float32)
+        self.value = np.full((lasers, len(plan.spots), cameras, vertices), np.nan, np.float32)
+        self.scale = np.zeros((lasers, len(plan.spots), cameras))
+        self.noise, self.shot, self.dark = (np.zeros((lasers, plan.views, vertices)) for _ in range(3))
 
-    def add(self, address: ImageAddress, image: RadianceImage, noise: F64, scale: float) -> None:
-        view, camera = address.view, self.plan.camera_of(address.view)
-        at = (address.laser, address.spot, camera)
-        reading = self.readings[view]
-        value = reading.operator @ image.radiance.ravel().astype(np.float64) * scale
-        seen = reading.share > MIN_SHARE
-        if image.saturated.any():
-            seen &= self.touched[view] @ image.saturated.ravel().astype(np.float64) == 0
-        self.value[at] = np.where(seen, value, np.nan)
-        self.dark[at] = self.squared[view] @ np.full(noise.size, float(image.variance.min())) * scale**2
-        self.noise[at] = self.squared[view] @ noise.ravel() * scale**2
-        self.shot[at] = self.squared[view] @ image.variance.ravel() * scale**2
+    def part(self, view: int) -> tuple[slice, int]:
+        """(spots, camera) of a view in `value` and `scale`."""
+        spots = self.plan.spots_at(self.plan.angle_of(view))
+        return slice(spots.start, spots.stop), self.plan.camera_of(view)
+
+    def add(self, way: str, part: Part) -> None:
+        """What came of some images."""
+        view, laser = part.task.sight.view, part.task.laser
+        rows, camera = part.task.sight.rows[way], self.plan.camera_of(view)
+        for address, value, scale in zip(part.task.addresses, part.value[way], part.scale, strict=True):
+            self.value[laser, address.spot, camera, rows] = value
+            self.scale[laser, address.spot, camera] = scale
+        self.noise[laser, view, rows] += part.alone[way][0]
+        self.shot[laser, view, rows] += part.alone[way][1]
+
+    def add_noise(self, sight: Sight, way: str, laser: int, sums: Sums, dark: float) -> None:
+        """The sums over all images of a view and laser. dark: a dark pixel's variance before the lens's gain."""
+        rows, operator = sight.rows[way], sight.operators[way].astype(np.float64)
+        squared = operator.multiply(operator).tocsr()
+        self.noise[laser, sight.view, rows] += squared @ sums.noise_variance().ravel()
+        self.shot[laser, sight.view, rows] += squared @ sums.shot.ravel()
+        self.dark[laser, sight.view, rows] = dark * squared.sum(axis=1)
+
+    def dark_variance(self) -> F32:
+        """(L, S, C, V) mm^-4, variance of the values without signal."""
+        out = np.zeros_like(self.value)
+        for view in range(self.plan.views):
+            spots, camera = self.part(view)
+            out[:, spots, camera] = self.scale[:, spots, camera, None] ** 2 * self.dark[:, view, None]
+        return out
 
     def noise_per_signal(self) -> F32:
         """(L, S, C, V) variance per signal; a property of laser, view and vertex, so averaged over a view's spots.
@@ -152,19 +159,16 @@ class _Gathered:
         As seen in the images, but not less than what the camera's own model says.
         """
         out = np.zeros_like(self.value)
-        for angle in range(len(self.plan.angles_rad)):
-            spots = self.plan.spots_at(angle)
-            part = np.s_[:, spots.start : spots.stop]
-            read = np.isfinite(self.value[part])
-            signal = np.where(read, np.maximum(self.value[part], 0.0), 0.0)
-            # Clipped after the mean: single estimates scatter to both sides, and clipping each would raise them all.
-            seen, own = (
-                np.maximum(np.where(read, v[part] - self.dark[part], 0.0).sum(axis=1, keepdims=True), 0.0)
-                for v in (self.noise, self.shot)
-            )
-            extra, total = np.maximum(seen, own), signal.sum(axis=1, keepdims=True)
-            mean = extra.sum(axis=3, keepdims=True) / np.maximum(total.sum(axis=3, keepdims=True), 1e-30)
-            out[part] = np.where(total > 0, extra / np.maximum(total, 1e-30), mean)
+        for view in range(self.plan.views):
+            spots, camera = self.part(view)
+            value = self.value[:, spots, camera]
+            read = np.isfinite(value)
+            total = np.where(read, np.maximum(value, 0.0), 0.0).sum(axis=1)
+            dark = np.where(read, self.scale[:, spots, camera, None] ** 2, 0.0).sum(axis=1) * self.dark[:, view]
+            # Clipped after the sum: single estimates scatter to both sides, and clipping each would raise them all.
+            extra = np.maximum(np.maximum(self.noise[:, view], self.shot[:, view]) - dark, 0.0)
+            mean = extra.sum(axis=1, keepdims=True) / np.maximum(total.sum(axis=1, keepdims=True), 1e-30)
+            out[:, spots, camera] = np.where(total > 0, extra / np.maximum(total, 1e-30), mean)[:, None]
         return out
 
     def expected(self, distance: F64) -> F64:
@@ -193,15 +197,14 @@ class _Gathered:
         shape = self.value.shape[1:]
         share, oblique, tilt = (np.zeros(shape, np.float32) for _ in range(3))
         for view, reading in enumerate(self.readings):
-            rows = self.plan.spots_at(self.plan.angle_of(view))
-            at = np.s_[rows.start : rows.stop, self.plan.camera_of(view)]
+            at = self.part(view)
             share[at], oblique[at] = reading.share, oblique_variance(reading.cosine)
             at_vertices, at_spots = outward_tilt(mesh, spots, glow[view].camera.position)
-            tilt[at] = (at_vertices + at_spots)[rows.start : rows.stop]
-        slope = self.noise_per_signal()
+            tilt[at] = (at_vertices + at_spots)[at[0]]
+        dark, slope = self.dark_variance(), self.noise_per_signal()
         distance = np.linalg.norm(spots.position[:, None] - np.asarray(mesh.vertices), axis=2)
         expected = self.expected(distance)[:, :, None]
-        relative = (self.dark + slope * expected) / expected**2 + ANGULAR**2 + oblique
+        relative = (dark + slope * expected) / expected**2 + ANGULAR**2 + oblique
         weight = np.where(np.isfinite(self.value), share / relative, 0.0)
         weight /= np.maximum(weight.sum(axis=2, keepdims=True), 1e-30)
         value = np.where(weight > 0, weight * self.value, 0.0).sum(axis=2)
@@ -214,7 +217,7 @@ class _Gathered:
             eta,
             spots,
             np.where(seen, value, np.nan).astype(np.float32),
-            (weight**2 * self.dark).sum(axis=2).astype(np.float32),
+            (weight**2 * dark).sum(axis=2).astype(np.float32),
             (weight**2 * slope).sum(axis=2).astype(np.float32),
             (incidence[:, None] + (common * oblique).sum(axis=1)).astype(np.float32),
             (common * tilt).sum(axis=1).astype(np.float64),
@@ -232,34 +235,37 @@ def take_samples(
     """Read every spot image once. `readings`: per way of reading, one `Reading` per view; the keys of the result."""
     plan, lasers = stream.plan, len(calibration.lasers)
     spots = locate_spots(mesh, calibration, plan, settings)
-    gathered = {name: _Gathered(lasers, plan, views) for name, views in readings.items()}
-    addresses = [a for a in plan.addresses() if a.kind == "spot" and spots.transmitted[a.spot] > 0]
+    gathered = {way: _Gathered(lasers, plan, views) for way, views in readings.items()}
+    sights = [
+        Sight.of(view, calibration, mesh, {way: views[view] for way, views in readings.items()})
+        for view in range(plan.views)
+    ]
     glow = tuple(_no_glow(calibration.view_camera(v), lasers, len(plan.spots)) for v in range(plan.views))
-    corrupt, saturated = [], 0
-    for address, raw in zip(addresses, stream.read_many(addresses), strict=True):
-        if isinstance(raw, CorruptImage):
-            log.warning("%s", raw)
-            corrupt.append(str(address))
-            continue
-        power = stream.meta(address).photodiode_w
-        if not power > 0:
-            log.warning("%s: the photodiode saw no light; image left out", address)
-            corrupt.append(str(address))
-            continue
-        image = calibration.radiance(raw, address.view, address.laser)
-        saturated += int(image.saturated.sum())
-        noise = noise_squared(image.radiance)
-        scale = np.pi / (spots.transmitted[address.spot] * power)
-        glow[address.view].image[address.laser] += image.radiance * scale
-        glow[address.view].included[address.laser, address.spot] = True
-        for g in gathered.values():
-            g.add(address, image, noise, scale)
-    masked = sum(_mask_highlights(g, spots, calibration, mesh, settings.highlight_deg) for g in gathered.values())
+    sums = {(sight.view, laser): Sums.zeros(sight.gain.shape) for sight in sights for laser in range(lasers)}
+    hidden = highlights(spots, calibration, plan, mesh, settings.highlight_deg)
+    images, lost, saturated, masked = 0, [], 0, 0
+    for part in resample(stream, calibration, sights, spots.transmitted, hidden):
+        view, laser = part.task.sight.view, part.task.laser
+        images += len(part.task.addresses)
+        lost += [str(address) for address in part.lost]
+        saturated += part.saturated
+        masked += part.hidden
+        sums[view, laser] += part.sums
+        glow[view].included[laser, [a.spot for a in part.task.addresses]] = part.scale > 0
+        for way, g in gathered.items():
+            g.add(way, part)
+    dark = [look_up(calibration.sensor, laser)[1].min() for laser in range(lasers)]
+    for sight in sights:
+        for laser in range(lasers):
+            total = sums[sight.view, laser]
+            glow[sight.view].image[laser][sight.window] = total.glow * sight.gain
+            for way, g in gathered.items():
+                g.add_noise(sight, way, laser, total, float(dark[laser]))
     samples = {name: g.combined(mesh, settings.eta, spots, glow) for name, g in gathered.items()}
     first = next(iter(samples.values()))
     statistics = SampleStatistics(
-        images=len(addresses),
-        corrupt=tuple(corrupt),
+        images=images,
+        corrupt=tuple(lost),
         saturated_pixels=saturated,
         spots=len(plan.spots),
         spots_too_oblique=int((spots.transmitted == 0).sum()),
@@ -273,13 +279,12 @@ def _no_glow(camera: PinholeCamera, lasers: int, spots: int) -> Glow:
     return Glow(camera, np.zeros((lasers, camera.height, camera.width)), np.zeros((lasers, spots), bool))
 
 
-def _mask_highlights(
-    gathered: _Gathered, spots: Spots, calibration: Calibration, mesh: trimesh.Trimesh, limit_deg: float
-) -> int:
-    """Blank what a camera near the beam's mirror direction reads inside the beam; returns the number of entries."""
-    count = 0
+def highlights(
+    spots: Spots, calibration: Calibration, plan: Plan, mesh: trimesh.Trimesh, limit_deg: float
+) -> dict[tuple[int, int], I64]:
+    """(view, spot) -> the vertices inside the beam, wherever the camera is near the beam's mirror direction."""
+    out = {}
     reach = spots.beam_radius + float(mesh.edges_unique_length.mean())
-    plan = gathered.plan
     for view in range(plan.views):
         towards = calibration.view_camera(view).position - spots.position
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
@@ -287,12 +292,9 @@ def _mask_highlights(
         half /= np.linalg.norm(half, axis=1, keepdims=True)
         close = (half * spots.normal).sum(axis=1) > np.cos(np.deg2rad(limit_deg))
         for spot in plan.spots_at(plan.angle_of(view)):
-            if close[spot] and spots.transmitted[spot] > 0:
-                lit = np.linalg.norm(mesh.vertices - spots.position[spot], axis=1) < reach
-                entries = gathered.value[:, spot, plan.camera_of(view)]
-                count += int(np.isfinite(entries[:, lit]).sum())
-                entries[:, lit] = np.nan
-    return count
+            if close[spot]:
+                out[view, spot] = np.flatnonzero(np.linalg.norm(mesh.vertices - spots.position[spot], axis=1) < reach)
+    return out
 
 
 def select_lasers(samples: Samples, lasers: NDArray[np.int64]) -> Samples:

@@ -11,11 +11,12 @@ from reconstruct_capture import ETA, rig
 from scipy import sparse
 
 from hw.interface import Aim
-from hw.record import RadianceImage
+from hw.record import RawImage, Sensor
 from pipeline.calibrate.camera import PinholeCamera
 from pipeline.capture.plan import ImageAddress, Plan
 from pipeline.reconstruct.profile import Measured
-from pipeline.reconstruct.samples import ANGULAR, OBLIQUE, Glow, Samples, _Gathered, noise_squared
+from pipeline.reconstruct.resample import Part, Sight, Sums, Task, _read
+from pipeline.reconstruct.samples import ANGULAR, OBLIQUE, Glow, Samples, _Gathered
 from pipeline.reconstruct.spots import Spots
 from pipeline.reconstruct.views import Reading
 
@@ -28,16 +29,16 @@ def gathered_twice(noise_front: float, cosine_back: float, share_back: float = 1
     plan = Plan(("front", "back"), (0.0,), (Aim(0, 0, 0),), 1)
     mesh = trimesh.creation.icosphere(subdivisions=1)
     size = len(mesh.vertices)
-    operator = sparse.csr_array((np.ones(size), (np.arange(size), np.zeros(size, int))), shape=(size, 1))
     readings = [
-        Reading(operator, np.full(size, share), np.full(size, cosine))
+        Reading(sparse.csr_array((size, 1)), np.full(size, share), np.full(size, cosine))
         for share, cosine in ((1.0, 0.9), (share_back, cosine_back))
     ]
     gathered = _Gathered(1, plan, readings)
+    gathered.scale[:] = 1.0
     for view, factor in enumerate((1.0, 1.5)):
-        variance = np.full((1, 1), (value * noise_front) ** 2 if view == 0 else 1e-20)
-        image = RadianceImage(np.full((1, 1), value * factor), variance, np.zeros((1, 1), bool))
-        gathered.add(ImageAddress(view, "spot", 0, 0), image, variance, 1.0)
+        variance = (value * noise_front) ** 2 if view == 0 else 1e-20
+        gathered.value[0, 0, view] = value * factor
+        gathered.noise[0, view] = gathered.shot[0, view] = gathered.dark[0, view] = variance
     up = np.array([[0.0, 0.0, 1.0]])
     way = np.array([[np.sqrt(1 - incidence**2), 0.0, -incidence]])
     spots = Spots(up, way, up, np.array([0]), np.full((1, 3), 1 / 3), np.ones(1), 1.0)
@@ -102,15 +103,30 @@ def test_noise_is_not_below_the_cameras_own_nor_counted_where_nothing_was_read()
     saturation) counts neither with its signal nor with its noise.
     """
     plan = Plan(("front",), (0.0,), tuple(Aim(0, i, 0) for i in range(4)), 1)
-    mesh = trimesh.creation.icosphere(subdivisions=1)
-    size = len(mesh.vertices)
-    operator = sparse.csr_array((np.ones(size), (np.arange(size), np.zeros(size, int))), shape=(size, 2))
-    gathered = _Gathered(1, plan, [Reading(operator, np.ones(size), np.ones(size))])
+    size, shape = 42, (9, 7)
+    operator = sparse.csr_array((np.ones(size), (np.arange(size), np.full(size, 31))), shape=(size, 63))
+    everything = slice(0, shape[0]), slice(0, shape[1])
+    sight = Sight(0, everything, {"it": np.arange(size)}, {"it": operator.astype(np.float32)}, np.ones(shape))
+    sensor = Sensor(1.0, 1, 4, 1.0, 0.0, 0.0, 0.0, (1.0,))
+    table = (np.array([2.0, 2.0, 200.0], np.float32), np.array([0.1, 0.5, 0.5], np.float32))
+    part = Part.of(Task(sight, 0, [ImageAddress(0, "spot", spot, 0) for spot in range(4)]))
     for spot in range(4):
-        image = RadianceImage(np.full((1, 2), 2.0), np.array([[0.5, 0.1]]), np.zeros((1, 2), bool))
-        gathered.add(ImageAddress(0, "spot", spot, 0), image, np.full((1, 2), 100.0 if spot == 3 else 0.0), 1.0)
-    gathered.value[:, 3] = np.nan
-    np.testing.assert_allclose(gathered.noise_per_signal()[0, :, 0], (0.5 - 0.1) / 2.0, rtol=1e-5)
+        charge = np.ones(shape, np.uint16)
+        charge[4, 3] = 2 if spot == 3 else 1  # scatter that is not to count
+        part.scale[spot] = 1.0
+        _read(
+            part,
+            spot,
+            RawImage(np.zeros(shape, np.uint8), charge),
+            sensor,
+            table,
+            np.arange(size) if spot == 3 else None,
+        )
+    assert part.hidden == size
+    gathered = _Gathered(1, plan, [Reading(operator, np.ones(size), np.ones(size))])
+    gathered.add("it", part)
+    gathered.add_noise(sight, "it", 0, part.sums, 0.1)
+    np.testing.assert_allclose(gathered.noise_per_signal()[0, :, 0], (0.5 - 0.1) / 2.0, rtol=1e-3)
 
 
 def test_noise_of_dark_samples_is_told_truly() -> None:
@@ -122,11 +138,16 @@ def test_noise_of_dark_samples_is_told_truly() -> None:
     pixel = rng.permutation(shape[0] * shape[1])[: 4 * size].reshape(size, 4)
     rows = np.repeat(np.arange(size), 4)
     operator = sparse.csr_array((np.full(4 * size, 0.25), (rows, pixel.ravel())), shape=(size, shape[0] * shape[1]))
+    everything = slice(0, shape[0]), slice(0, shape[1])
+    sight = Sight(0, everything, {"it": np.arange(size)}, {"it": operator}, np.ones(shape))
     gathered = _Gathered(1, plan, [Reading(operator, np.ones(size), np.ones(size))])
+    sums = Sums.zeros(shape)
     for spot in range(200):
         radiance = 0.1 * sigma + sigma * rng.standard_normal(shape)
-        image = RadianceImage(radiance, np.full(shape, 1e-3 * sigma**2), np.zeros(shape, bool))
-        gathered.add(ImageAddress(0, "spot", spot, 0), image, noise_squared(radiance), 1.0)
+        gathered.value[0, spot, 0] = operator @ radiance.ravel()
+        sums.add(radiance, np.full(shape, 1e-3 * sigma**2))
+    gathered.scale[:] = 1.0
+    gathered.add_noise(sight, "it", 0, sums, 1e-3 * sigma**2)
     told = gathered.noise_per_signal()[0, :, 0] * np.maximum(gathered.value[0, :, 0], 0)
     actual = gathered.value[0, :, 0].var(axis=0).mean()
     assert told.mean() == pytest.approx(actual, rel=0.1)

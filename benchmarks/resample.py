@@ -1,0 +1,119 @@
+"""Images per second from the stream's files to readings at the vertices of a scan (thesis 5.1: 50 on a 3 GHz Xeon).
+
+Frames of 24 views are captured by the twin (`benchmarks.frames`), one spot an angle; the stream that is timed holds
+them over and over, as if every angle had many spots. Timed is all that a run does with an image: reading, checksum,
+decoding, radiance, readings, sums for the noise. Rounds alternate with decoding alone and with the plain computation
+of the same readings in double precision, whose deviation is told in units of a reading's noise.
+"""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.frames import capture_frames
+from hw.interface import Aim
+from pipeline.calibrate.calibration import nominal_calibration
+from pipeline.capture.plan import Plan
+from pipeline.capture.stream import StreamReader, StreamWriter
+from pipeline.reconstruct.resample import Part, Sight, resample
+from pipeline.reconstruct.views import footprint_reading
+from pipeline.resources import usable_cores
+
+MAX_VIEW_DEG = 75.0
+ETA = 1.3
+
+
+def run(quick: bool = False) -> dict[str, Any]:
+    """Keys of benchmarks.md, CPU milliseconds an image of each stage, and the error."""
+    from disco_twin.camera.lars3 import lars3_sensor
+
+    angles, spots, rounds = (2, 16, 3) if quick else (12, 24, 5)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        world = capture_frames(folder, angles, 20_000 if quick else 100_000, angles, 2000 if quick else 8924)
+        rig, mesh = world.scene.rig, world.scan
+        calibration = nominal_calibration(rig, lars3_sensor(rig))
+        plan = repeated(folder, spots)
+        readings = [
+            {"footprint": footprint_reading(mesh, calibration.view_camera(view), ETA, MAX_VIEW_DEG)}
+            for view in range(plan.views)
+        ]
+        sights = [Sight.of(view, calibration, mesh, readings[view]) for view in range(plan.views)]
+        lit = np.ones(len(plan.spots))
+        figures: dict[str, list[float]] = {}
+
+        def note(name: str, count: int, work: Callable[[], object]) -> None:
+            cpu, start = time.process_time(), time.perf_counter()
+            work()
+            figures.setdefault(f"{name}images_per_s", []).append(count / (time.perf_counter() - start))
+            figures.setdefault(f"{name}cpu_ms", []).append(1e3 * (time.process_time() - cpu) / count)
+
+        with StreamReader(folder / "repeated") as stream:
+            some = [stream.plan.index(a) for a in stream.plan.addresses() if a.kind == "spot"]
+            few = some[:: max(1, len(some) // 20)]
+            for _ in range(rounds):
+                note("", len(some), lambda: [None for _ in resample(stream, calibration, sights, lit, {})])
+                note("decode_", len(some), lambda: [None for _ in stream.read_many(some, usable_cores())])
+                note("plain_", len(few), lambda: [plain(stream, calibration, readings, i) for i in few])
+            part = next(iter(resample(stream, calibration, sights[:1], lit, {})))
+            error = error_over_noise(part, stream, calibration, readings)
+    result: dict[str, Any] = {
+        "images": len(some),
+        "views": len(sights),
+        "vertices": len(mesh.vertices),
+        "width": rig.cameras[0].width,
+        "height": rig.cameras[0].height,
+        "threads": usable_cores(),
+        "error_over_noise": error,
+    }
+    for name, values in figures.items():
+        result |= {name: statistics.median(values), f"{name}_min": min(values), f"{name}_max": max(values)}
+    return {"name": "resample", "quick": quick, **result}
+
+
+def repeated(folder: Path, spots: int) -> Plan:
+    """Write `folder / "repeated"`: every view's images again and again, as those of `spots` spots an angle.
+
+    Where the sweep put no spot at an angle, the camera's images at the others stand in.
+    """
+    with StreamReader(folder / "capture") as captured:
+        old = captured.plan
+        aims = tuple(Aim(angle, spot, 0) for angle in range(len(old.angles_rad)) for spot in range(spots))
+        plan = Plan(old.cameras, old.angles_rad, aims, old.lasers)
+        lit = [i for i in range(len(old)) if old.address(i).kind == "spot"]
+        with StreamWriter(folder / "repeated", plan) as stream:
+            for address in plan.addresses():
+                own = [i for i in lit if old.address(i).view == address.view]
+                own = own or [i for i in lit if old.camera_of(old.address(i).view) == old.camera_of(address.view)]
+                index = own[(address.spot * plan.lasers + address.laser) % len(own)]
+                stream.append(address, captured.read(index), captured.meta(index))
+    return plan
+
+
+def plain(stream: StreamReader, calibration: Any, readings: Any, index: int) -> Any:
+    """(V,) readings of one image in double precision, as pi L / (F_t Phi) with F_t(w_i) = 1."""
+    address = stream.plan.address(index)
+    image = calibration.radiance(stream.read(index), address.view, address.laser)
+    scale = np.pi / stream.meta(index).photodiode_w
+    return readings[address.view]["footprint"].operator @ image.radiance.ravel().astype(np.float64) * scale
+
+
+def error_over_noise(part: Part, stream: StreamReader, calibration: Any, readings: Any) -> float:
+    """Largest deviation of a reading from the plain one, in standard deviations of that reading."""
+    sight, worst = part.task.sight, 0.0
+    rows = sight.rows["footprint"]
+    operator = readings[sight.view]["footprint"].operator[rows]
+    for value, scale, address in zip(part.value["footprint"], part.scale, part.task.addresses, strict=True):
+        index = stream.plan.index(address)
+        image = calibration.radiance(stream.read(index), sight.view, address.laser)
+        variance = operator.multiply(operator) @ image.variance.ravel().astype(np.float64) * scale**2
+        exact = plain(stream, calibration, readings, index)[rows]
+        worst = max(worst, float(np.nanmax(np.abs(value - exact) / np.sqrt(variance))))
+    return worst
