@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 OUT ?= out/quick
 
-.PHONY: demo test lint validate install references picture clean
+.PHONY: demo test lint validate install references picture curves clean
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -15,6 +15,7 @@ help:
 	@echo "make lint      style, types, import rules"
 	@echo "make validate  the slow tests as well: the figures that quick must reach, among them"
 	@echo "make references  render the quick scene's reference images anew"
+	@echo "make curves    error against seconds of the light's estimators: docs/benchmarks/walk.svg (minutes)"
 	@echo "make picture   the README's picture, from the demo's run"
 
 install: $(READY)
@@ -53,6 +54,10 @@ references: $(READY)
 
 picture: $(READY)
 	$(BIN)/python -m disco_twin.picture $(OUT) docs/picture.png
+
+curves: $(READY)
+	$(BIN)/python -m benchmarks walk --quick --json docs/benchmarks/walk.json
+	$(BIN)/python -m benchmarks.plot docs/benchmarks/walk.json docs/benchmarks/walk.svg
 
 clean:
 	rm -rf $(VENV) out build dist

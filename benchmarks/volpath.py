@@ -16,10 +16,15 @@ from pipeline.relight.lights import Directional, Uniform
 DEPTH = 4000  # Russian roulette starts here, that is, never: volpath caps survival at .95 even on null collisions
 
 
-def volpath_scene(obj: TwinObject, camera: PinholeCamera, light: Directional | Uniform, folder: Path) -> Any:
-    """The object (laser 0), one undistorted camera and one emitter; the mesh is written to `folder`."""
+def volpath_scene(
+    obj: TwinObject, camera: PinholeCamera, light: Directional | Uniform | dict[str, Any], folder: Path
+) -> Any:
+    """The object (laser 0), one undistorted camera and one emitter (or Mitsuba's own description of one); the mesh is
+    written to `folder`.
+    """
     path = folder / "object.ply"
     obj.mesh.export(path, vertex_normal=False)
+    emitter: dict[str, Any]
     medium, eta = obj.medium, obj.boundary.eta
     to_world = mi.ScalarTransform4f().translate(list(medium.low)).scale(list(medium.high - medium.low))
 
@@ -31,11 +36,12 @@ def volpath_scene(obj: TwinObject, camera: PinholeCamera, light: Directional | U
     rough = {
         "type": "roughdielectric", "int_ior": eta, "ext_ior": 1.0, "alpha": obj.boundary.alpha, "distribution": "ggx",
     }  # fmt: skip
-    emitter = (
-        {"type": "constant", "radiance": light.radiance}
-        if isinstance(light, Uniform)
-        else {"type": "directional", "direction": list(light.direction), "irradiance": light.irradiance}
-    )
+    if isinstance(light, Uniform):
+        emitter = {"type": "constant", "radiance": light.radiance}
+    elif isinstance(light, Directional):
+        emitter = {"type": "directional", "direction": list(light.direction), "irradiance": light.irradiance}
+    else:
+        emitter = light
     position = camera.position
     view = mi.ScalarTransform4f().look_at(
         origin=list(position), target=list(position + camera.pose[2, :3]), up=list(-camera.pose[1, :3])

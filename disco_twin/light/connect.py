@@ -17,6 +17,20 @@ from disco_twin.light import sampling
 from disco_twin.light.sampling import Rng
 from disco_twin.light.tables import FAR, ROW, Cameras, Images, Tables, cell_index, medium_at
 
+MOST_CAMERAS = 6  # that one collision or exit connects to
+
+
+def drawn_camera(cams: Cameras, k: Any, rng: Rng) -> tuple[Any, float]:
+    """The k-th camera to connect to, and what its contribution counts for.
+
+    Of many cameras each connection reaches MOST_CAMERAS only, drawn one from each of as many equal stretches of the
+    list: a walk then costs the same for 24 cameras as for six (docs/decisions/0051).
+    """
+    if cams.count <= MOST_CAMERAS:
+        return k, 1.0
+    stretch = cams.count / MOST_CAMERAS
+    return dr.minimum(mi.UInt32((mi.Float(k) + rng.next()) * stretch), cams.count - 1), stretch
+
 
 def refracted_axis(t: Tables, normal: Any, towards: Any) -> Any:
     """Inside direction that a smooth boundary refracts into `towards` (Snell), the lobe's axis."""
@@ -125,11 +139,12 @@ def straight_transmittance(t: Tables, origin: Any, target: Any, rng: Rng) -> tup
 def connect_lobes(
     t: Tables, cams: Cameras, images: Images, tag: Any, point: Any, before: Any, weight: Any, rng: Rng
 ) -> Rng:
-    """Connect one drawn collision to every camera. `before` is the flight's direction before the collision."""
+    """Connect one drawn collision to the cameras. `before` is the flight's direction before the collision."""
     pixels = cams.width * cams.height
     context = mi.BSDFContext(mi.TransportMode.Importance)
-    camera = mi.UInt32(0)
-    while dr.hint(camera < cams.count, label="lobes"):
+    turn = mi.UInt32(0)
+    while dr.hint(turn < min(cams.count, MOST_CAMERAS), label="lobes"):
+        camera, times = drawn_camera(cams, turn, rng)
         base = (tag * (images.layers * cams.count) + camera) * (t.lasers * pixels)
         if dr.hint(t.matched, mode="scalar"):
             position, towards, pixel, factor, seen = project(cams, camera, point)
@@ -138,7 +153,7 @@ def connect_lobes(
                 phase = sampling.henyey_greenstein_pdf(dr.dot(before, towards), t.g)
                 splat(
                     images.lobes, images.lobes_squared, images, base + pixel, pixels,
-                    weight * (phase * through * factor), t.lasers, rng, through > 0.0,
+                    weight * (phase * through * factor * times), t.lasers, rng, through > 0.0,
                 )  # fmt: skip
         else:
             row = camera * ROW
@@ -159,7 +174,7 @@ def connect_lobes(
                     seen &= (dr.dot(hit.n, towards) > 0.0) & (dr.dot(hit.n, omega) > 0.0)
                     if dr.hint(seen):
                         value = t.bsdf.eval(context, hit, hit.to_local(towards), True)[0]
-                        value *= factor * phase / (phase + lobe)
+                        value *= factor * times * phase / (phase + lobe)
                         if dr.hint(value > 0.0):
                             passed, rng = transmittance(t, point, omega, hit.t, rng)
                             value *= passed
@@ -169,7 +184,7 @@ def connect_lobes(
                                 images.lobes, images.lobes_squared, images, base + pixel, pixels,
                                 weight * value, t.lasers, rng, ~blocked,
                             )  # fmt: skip
-        camera += 1
+        turn += 1
     return rng
 
 
@@ -178,19 +193,20 @@ def connect_exit(
     t: Tables, cams: Cameras, images: Images, tag: Any, si: Any, direction: Any, weight: Any,
     collision: Any, phase: Any, lobed: Any, surface_only: Any, rng: Rng,
 ) -> Rng:  # fmt: skip
-    """Connect a photon that meets the surface to every camera through the boundary's BSDF.
+    """Connect a photon that meets the surface to the cameras through the boundary's BSDF.
 
     collision, phase, lobed: the flight's last collision, the phase density of its direction and whether a lobe
     connection could have made the same path (then the balance heuristic shares it).
     """
     pixels = cams.width * cams.height
     context = mi.BSDFContext(mi.TransportMode.Importance)
-    camera = mi.UInt32(0)
-    while dr.hint(camera < cams.count, label="exits"):
+    turn = mi.UInt32(0)
+    while dr.hint(turn < min(cams.count, MOST_CAMERAS), label="exits"):
+        camera, times = drawn_camera(cams, turn, rng)
         position, towards, pixel, factor, seen = project(cams, camera, si.p)
         seen &= dr.dot(si.n, towards) > 0.0
         if dr.hint(seen):
-            value = t.bsdf.eval(context, si, si.to_local(towards), True)[0] * factor
+            value = t.bsdf.eval(context, si, si.to_local(towards), True)[0] * (factor * times)
             _, lobe, usable = lobe_density(t, collision, direction, position)
             value *= dr.select(lobed & usable, phase / (phase + lobe), 1.0)
             if dr.hint(value > 0.0):
@@ -201,5 +217,5 @@ def connect_exit(
                     layer = dr.select(surface_only, mi.UInt32(1), mi.UInt32(0))
                 base = ((tag * images.layers + layer) * cams.count + camera) * (t.lasers * pixels) + pixel
                 splat(images.exits, images.exits_squared, images, base, pixels, weight * value, t.lasers, rng, ~blocked)
-        camera += 1
+        turn += 1
     return rng

@@ -39,10 +39,10 @@ class Lobe:
     length: float
 
     @classmethod
-    def of(cls, medium: Medium) -> Lobe:
-        """Three and twelve mean free paths, the best of what docs/decisions/0010 measured."""
+    def of(cls, medium: Medium, alpha: float) -> Lobe:
+        """Five and twenty mean free paths, the narrower the smoother: docs/decisions/0010 and 0051."""
         free_path = 1.0 / max(float(medium.sigma_t.mean()), 1e-9)
-        return cls(100.0, 3.0 * free_path, 12.0 * free_path)
+        return cls(40.0 / max(alpha, 0.02), 5.0 * free_path, 20.0 * free_path)
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Transport:
 
     def __init__(self, obj: TwinObject, cells: int = 128, lobe: Lobe | None = None) -> None:
         self.object = obj
-        self.lobe = lobe or Lobe.of(obj.medium)
+        self.lobe = lobe or Lobe.of(obj.medium, obj.boundary.alpha)
         self.vertices = np.asarray(obj.mesh.vertices, np.float64)
         self.faces = np.asarray(obj.mesh.faces, np.int64)
         self.radius = float(np.linalg.norm(self.vertices, axis=1).max()) * 1.001

@@ -9,9 +9,12 @@ import types
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from benchmarks import __main__ as benchmarks
+from benchmarks.plot import plot
+from benchmarks.rival import ball, tetrahedra
 
 
 def fake(quick: bool) -> dict[str, Any]:
@@ -40,3 +43,28 @@ def test_an_unknown_name_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as stop:
         benchmarks.main(["nothing", "--json", str(tmp_path / "f.json")])
     assert stop.value.code == 2
+
+
+def test_curves_become_a_picture(tmp_path: Path) -> None:
+    """One panel a decade, one line an estimator; curves of other benchmarks' names are left out."""
+    points = [{"seconds": t, "error": t**-0.5} for t in (1.0, 10.0)]
+    names = ["R_d, ball: analogue, decade 0", "R_d, ball: effort 3, decade 0", "R_d, ball: effort 3, decade -1", "other"]
+    record = tmp_path / "walk.json"
+    record.write_text(json.dumps({"curves": [{"name": n, "points": points} for n in names]}))
+    plot(record, tmp_path / "walk.svg")
+    drawn = (tmp_path / "walk.svg").read_text()
+    assert "R_d, ball, decade -1" in drawn
+    assert "effort 3" in drawn
+    assert "other" not in drawn
+
+
+def test_tetrahedra_fill_the_ball() -> None:
+    """The rival's mesh has the ball's volume, every tetrahedron the right way round, and its medium's mean."""
+    obj = ball()
+    nodes, cells, medium, rows = tetrahedra(obj)
+    a, b, c, d = (nodes[cells[:, k] - 1] for k in range(4))
+    volume = np.einsum("ij,ij->i", b - a, np.cross(c - a, d - a)) / 6
+    assert volume.min() >= 0
+    assert volume.sum() == pytest.approx(obj.mesh.volume, rel=1e-9)
+    sigma_t = (rows[medium, :2].sum(axis=1) * volume).sum() / volume.sum()
+    assert sigma_t == pytest.approx(float(obj.medium.sigma_t.mean()), rel=0.01)

@@ -14,6 +14,7 @@ from significance import assert_z, z_of_difference, z_of_replicates
 from test_samplers import streams
 from twins import beam, block, camera, pixel_areas, twin
 
+from disco_twin.light import connect
 from disco_twin.light.connect import project, transmittance
 from disco_twin.light.distance import build_distance_field, sample_surface
 from disco_twin.light.tables import medium_at
@@ -51,15 +52,15 @@ def blocks(images: F64, side: int) -> F64:
     return cut.reshape(*front, -1)
 
 
-@pytest.mark.parametrize("g", [0.0, 0.8])
-def test_lobe_connection_is_unbiased(g: float) -> None:
+@pytest.mark.parametrize(("g", "alpha"), [(0.0, 0.3), (0.8, 0.3), (0.0, 0.05)])
+def test_lobe_connection_is_unbiased(g: float, alpha: float) -> None:
     """Rationale: lobe connections and exits share each path by the balance heuristic; a density that is wrong, or used
     in one technique only, moves energy.
 
     Expected behaviour: with lobes, images equal those of plain exits (reach 0) in every block of pixels, in both
     layers, in total, and the noise is lower.
     """
-    obj = bumpy(g=g)
+    obj = bumpy(alpha=alpha, g=g)
     views = [camera(place, 13.0, 24) for place in VIEWS]
     images = []
     for lobe, walks in ((None, 2_000), (Lobe(100.0, 0.0, 0.0), 12_000)):
@@ -71,11 +72,34 @@ def test_lobe_connection_is_unbiased(g: float) -> None:
     cut = [blocks(i, 6) for i in images]
     busy = blocks((plain > 0).mean(axis=0), 6) > 4  # enough hits for a normal error
     assert busy.sum() > 20
-    assert_z(z_of_difference(cut[0][:, busy], cut[1][:, busy]), f"blocks, g = {g}")
+    assert_z(z_of_difference(cut[0][:, busy], cut[1][:, busy]), f"blocks, g = {g}, alpha = {alpha}")
     total = [i.sum(axis=(-1, -2)) for i in images]
-    assert_z(z_of_difference(*total), f"layers and cameras, g = {g}")
+    assert_z(z_of_difference(*total), f"layers and cameras, g = {g}, alpha = {alpha}")
     per_walk = [t[:, 0].var(axis=0, ddof=1) * n for t, n in zip(total, (2_000, 12_000), strict=True)]
     assert np.all(per_walk[0] < per_walk[1] / 2)
+
+
+@pytest.mark.parametrize("kind", ["rough", "matched"])
+def test_many_cameras_are_drawn_from(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rationale: of many cameras each connection reaches a few, whose contributions count for the others.
+
+    Expected behaviour: seven cameras, two of them drawn, show what all seven show when every one is reached, block by
+    block of pixels.
+    """
+    obj = bumpy(kind)
+    places = [(350 * math.cos(a), 350 * math.sin(a), 60.0 * (-1) ** k) for k, a in enumerate(np.arange(7) * 0.9)]
+    views = [camera(place, 13.0, 16) for place in places]
+    transport = Transport(obj, cells=64)
+    images = []
+    for most, walks, seed in ((2, 6_000, 75), (7, 3_000, 76)):
+        monkeypatch.setattr(connect, "MOST_CAMERAS", most)
+        traced = transport.trace(beam(REPLICATES, **SPOT), REPLICATES, walks, seed=seed, cameras=views)
+        assert traced.images is not None
+        images.append(traced.images[:, 0, :, 0].astype(float))
+    busy = blocks((images[0] > 0).mean(axis=0), 4) > 4
+    assert busy.sum() > 40
+    assert_z(z_of_difference(*[blocks(i, 4)[:, busy] for i in images]), f"{kind}: blocks")
+    assert_z(z_of_difference(*[i.sum(axis=(-1, -2)) for i in images]), f"{kind}: cameras")
 
 
 def test_cameras_see_what_leaves() -> None:
