@@ -11,7 +11,7 @@ ENDING = re.compile(r"^(.*): (.*), decade (-?\d)$")
 
 
 def plot(record: Path, picture: Path) -> None:
-    """One row of panels for each quantity, one panel for each decade, one line for each estimator; dots are measured."""
+    """One row of panels for each quantity, one panel for each decade, one line an estimator; dots are measured."""
     import matplotlib
 
     matplotlib.use("svg")

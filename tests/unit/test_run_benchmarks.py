@@ -48,7 +48,7 @@ def test_an_unknown_name_is_refused(tmp_path: Path) -> None:
 def test_curves_become_a_picture(tmp_path: Path) -> None:
     """One panel a decade, one line an estimator; curves of other benchmarks' names are left out."""
     points = [{"seconds": t, "error": t**-0.5} for t in (1.0, 10.0)]
-    names = ["R_d, ball: analogue, decade 0", "R_d, ball: effort 3, decade 0", "R_d, ball: effort 3, decade -1", "other"]
+    names = [f"R_d, ball: {n}" for n in ("analogue, decade 0", "effort 3, decade 0", "effort 3, decade -1")] + ["other"]
     record = tmp_path / "walk.json"
     record.write_text(json.dumps({"curves": [{"name": n, "points": points} for n in names]}))
     plot(record, tmp_path / "walk.svg")
