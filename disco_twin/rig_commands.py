@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,41 @@ def _try(name: str, check: Callable[[], str]) -> Finding:
         return Finding(name, False, str(error))
 
 
+class Closable(Protocol):
+    """A driver."""
+
+    def close(self) -> None: ...
+
+
+C = TypeVar("C", bound=Closable)
+
+
+@contextmanager
+def _using(device: C) -> Iterator[C]:
+    """The device, closed at the end. What fails in closing never takes the place of what went wrong before.
+
+    At Ctrl-C a laser's guard is faster than we are, and closing fails: that must not look like a test that failed,
+    after which the next laser would be tried.
+    """
+    try:
+        yield device
+    except BaseException:
+        try:
+            device.close()
+        except DiscoError as error:
+            log.info("closing: %s", error)
+        raise
+    device.close()
+
+
+@contextmanager
+def _shut_after(board: Board) -> Iterator[None]:
+    try:
+        yield
+    finally:
+        board.shut()
+
+
 def _connector(file: DevicesFile, logs: Path | None) -> Connector:
     """For real devices: what is emulated is left out by the callers."""
     if logs is not None:
@@ -74,21 +109,17 @@ def probe(file: DevicesFile, scene: RigConfig | None, logs: Path | None = None) 
     connect = _connector(file, logs)
 
     def laser(index: int) -> str:
-        head = connect.omicron(index)
-        found = head.identity
-        head.close()
+        with _using(connect.omicron(index)) as head:
+            found = head.identity
         return f"{found.model} {found.wavelength_nm:g} nm, {found.max_power_mw:g} mW, no. {found.serial_number}; off"
 
     def board() -> str:
-        driver = connect.board()
-        driver.close()
-        return "MM-Ard; every line low"
+        with _using(connect.board()):
+            return "MM-Ard; every line low"
 
     def table() -> str:
-        driver = connect.table()
-        angle = np.rad2deg(driver.angle_rad())
-        driver.close()
-        return f"{file.turntable.kind}, at {angle:.2f} deg"
+        with _using(connect.table()) as driver:
+            return f"{file.turntable.kind}, at {np.rad2deg(driver.angle_rad()):.2f} deg"
 
     for index, device in enumerate(file.lasers):
         if device.port != EMULATED:
@@ -104,20 +135,14 @@ def probe(file: DevicesFile, scene: RigConfig | None, logs: Path | None = None) 
 
 
 def _metered(connect: Connector) -> float:
-    meter = connect.meter()
-    try:
+    with _using(connect.meter()) as meter:
         return meter.read()
-    finally:
-        meter.close()
 
 
 def _camera_says(file: DevicesFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
     assert file.sensor is not None
-    camera = open_camera(device, file.sensor, shape)
-    try:
+    with _using(open_camera(device, file.sensor, shape)) as camera:
         return camera.grabber.identity()
-    finally:
-        camera.close()
 
 
 def selftest(file: DevicesFile, scene: RigConfig | None, armed: bool, logs: Path | None = None) -> Iterator[Finding]:
@@ -151,8 +176,7 @@ def selftest(file: DevicesFile, scene: RigConfig | None, armed: bool, logs: Path
 
 
 def _test_table(connect: Connector) -> str:
-    table = connect.table()
-    try:
+    with _using(connect.table()) as table:
         table.home()
         for angle in (TEST_ANGLE_DEG, 0.0):
             table.move(float(np.deg2rad(angle)))
@@ -163,20 +187,15 @@ def _test_table(connect: Connector) -> str:
                 )
                 raise DeviceFault(table.link.url, "turntable", problem, "check microsteps_per_deg in the rig file")
         return f"homed, turned to {TEST_ANGLE_DEG:g} deg and back"
-    finally:
-        table.close()
 
 
 def _test_camera(file: DevicesFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
     assert file.sensor is not None
-    camera = open_camera(device, file.sensor, shape)
-    try:
+    with _using(open_camera(device, file.sensor, shape)) as camera:
         black = require_black(camera, file.sensor)
         for _ in range(FRAMES):
             camera.expose()
         return f"{FRAMES} brackets, {camera.lost} frames taken again, black level {black:.1f} DN"
-    finally:
-        camera.close()
 
 
 def _test_mirrors(file: DevicesFile, board: Board) -> str:
@@ -204,18 +223,14 @@ def _test_dark(file: DevicesFile, board: Board) -> str:
 
 
 def _test_off(connect: Connector, index: int) -> str:
-    head = connect.omicron(index)
-    try:
+    with _using(connect.omicron(index)) as head:
         return f"{head.measured_mw():.2f} mW while off (not armed: --arm lets it emit)"
-    finally:
-        head.close()
 
 
 def _test_laser(connect: Connector, board: Board, index: int) -> str:
     """Emission, gate and photodiode against the set point, then off, with the gate open, against darkness."""
     file, wiring = connect.file, connect.file.lasers[index]
-    head = connect.omicron(index)
-    try:
+    with _using(connect.omicron(index)) as head, _shut_after(board):
         head.arm(wiring.power_mw)
         head.emit()
         connect.clock.sleep(file.warm_up_s)
@@ -236,9 +251,6 @@ def _test_laser(connect: Connector, board: Board, index: int) -> str:
                 f"pin {wiring.photodiode_pin}", head.name, problem, "check the wiring of gate and interlock"
             )
         return f"set {wiring.power_mw:g} mW, own reading {own:.2f} mW, photodiode {seen:.2f} mW{meter}; off again"
-    finally:
-        board.shut()
-        head.close()
 
 
 # ---- emulated devices for another program

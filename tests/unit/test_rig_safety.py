@@ -15,7 +15,7 @@ from disco_twin.firmware.emulate import Emulation
 from disco_twin.rig import TwinRig
 from disco_twin.rig_commands import rig_file_of, selftest, served
 from disco_twin.rig_file import load_rig_file
-from hw.errors import DeviceFault, DiscoError
+from hw.errors import DeviceFault, DiscoError, SwitchedOff
 from hw.interface import gate_open
 from hw.rig import Refused
 from pipeline.capture.loop import capture
@@ -213,6 +213,29 @@ def test_probe_and_selftest_of_served_devices(
         assert end.value.code == 1
         assert said.count("FAIL") == 2 and "is not an MM-Ard board" in said and "laser9" in said
         assert "Traceback" not in said and said.count("Remedy") == 2
+
+
+def test_ctrl_c_in_a_selftest_does_not_go_on_to_the_next_laser(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The guard closes its port at the signal, so that closing the laser fails."""
+    monkeypatch.setattr("hw.devices.mm_ard.BOOT_S", 0.05)
+    tried = []
+
+    class Head:
+        def arm(self, power_mw: float) -> None:
+            tried.append(power_mw)
+
+        def emit(self) -> None:
+            raise KeyboardInterrupt
+
+        def close(self) -> None:
+            raise SwitchedOff("guard://laser0", "the port of the laser", "is closed", "none")
+
+    monkeypatch.setattr("disco_twin.assembly.Connector.omicron", lambda self, index: Head())
+    with served(RIG, 3, tmp_path / "ports") as path:
+        findings = selftest(load_rig_file(path), None, armed=True)
+        with pytest.raises(KeyboardInterrupt):
+            list(findings)
+    assert tried == [10.0]
 
 
 def test_nothing_real_is_said_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
