@@ -64,7 +64,9 @@ def capture(
                     with rig:
                         _restore(rig, stream, sensor)
                         _sweep(rig, stream, signals, progress)
-                except (KeyboardInterrupt, DiscoError):
+                except KeyboardInterrupt:
+                    raise _interrupted(stream) from None
+                except DiscoError:
                     if signals.stopped:  # what fails on the way out does not matter any more
                         raise _interrupted(stream) from None
                     raise
