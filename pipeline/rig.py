@@ -96,6 +96,7 @@ class FaultsConfig(Strict):
     mode_hop: bool = False
     speckle: bool = False
     flare: bool = False
+    scanner: bool = False  # the scan is made from a cloud of points, with the scanner's errors
 
 
 class RigConfig(Strict):

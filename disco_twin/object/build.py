@@ -10,9 +10,11 @@ import trimesh
 from disco_twin.object import shapes
 from disco_twin.object.media import Medium, build_medium
 from disco_twin.object.mesh import check_size, hat_basis, read_mesh, remesh
+from disco_twin.object.scanner import scan_points
 from disco_twin.object.schema import Box, MeshFile, ObjectConfig, Pebble, Sphere, Torus
 from disco_twin.scene import MOST_VERTICES, Scene
 from hw.errors import InputError
+from pipeline.calibrate.geometry import reconstruct_surface
 
 __all__ = ["Boundary", "Medium", "TwinObject", "build_object", "build_scan", "hat_basis"]
 
@@ -60,6 +62,8 @@ def build_scan(scene: Scene, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
                 remedy="set scan.vertices",
             )
         return mesh
+    if scene.rig.faults.scanner:
+        return reconstruct_surface(*scan_points(mesh, scene.seed), vertices).mesh
     if isinstance(shape, Box):
         return shapes.box(shape, triangles=2 * vertices)  # keeps the edges sharp
     return remesh(mesh, vertices)

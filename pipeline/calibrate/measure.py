@@ -88,8 +88,9 @@ class Measured:
             "pose_error_mm": [float(x) for x in poses.translation.max(axis=0)],
             "ambiguity": list(poses.ambiguity),
             "projector_residual_mm": fit.rms_mm,
-            "spots_false": int(fit.false.sum()),
-            "spots_used": int((~fit.false).sum()),
+            "spot_images": fit.images,
+            "spot_hidden": fit.images - fit.sightings,
+            "spot_false": int(fit.false.sum()),
             "peak_shift_mm": {"along_light": float(fit.shift[0]), "towards_camera": float(fit.shift[1])},
             "peak_shift_error_mm": [float(x) for x in fit.shift_error],
         }
@@ -303,6 +304,7 @@ def measure_projector(
     true = np.linalg.norm(fit.misses(place, steps, normal, eye), axis=1) < GATE * fit.rms_mm
     log.info("projector: %d of %d sightings of %d images agree", int(true.sum()), len(spot), len(found.peaks))
     fit = refine(nominal, place[true], steps[true], normal[true], eye[true], size, group[true])
+    fit = replace(fit, false=~true, images=len(found.peaks), sightings=len(spot))
     return with_pose_error(fit, poses, int(np.bincount(np.concatenate(views)[true]).argmax()))
 
 

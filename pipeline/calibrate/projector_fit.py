@@ -147,6 +147,7 @@ class ProjectorFit:
 
     shift: (2,) mm by which a spot's peak moves along the light's way and towards the eye, per unit of the direction's
     tangential part (Godin et al. 2001), and its standard deviations
+    images, sightings: how many were looked at, and how many of them show the spot itself
     """
 
     projector: TwoMirrorProjector
@@ -155,6 +156,8 @@ class ProjectorFit:
     false: Flags
     shift: F64
     shift_error: F64
+    images: int = 0
+    sightings: int = 0
 
     def misses(self, points: F64, steps: F64, normals: F64, to_eye: F64) -> F64:
         """(N, 2) mm from the beam's axis to spots, across it."""

@@ -1,0 +1,76 @@
+"""All faults by one switch, and what the calibration's budget replaces."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from disco_twin.budget import VARIANTS, score_budget, true_calibration
+from disco_twin.camera.lars3 import lars3_sensor
+from disco_twin.deviation import actual_rig
+from disco_twin.folder import RunFolder
+from disco_twin.object.build import hat_basis
+from disco_twin.scene import load_scene
+from disco_twin.world import World
+from hw.errors import InputError
+from hw.interface import Aim
+from pipeline.calibrate.calibration import nominal_calibration
+
+QUICK = Path(__file__).parents[2] / "scenes" / "quick.toml"
+
+
+def test_one_switch_turns_all_faults_on() -> None:
+    scene = load_scene(QUICK, faults=True)
+    assert all(scene.rig.faults.model_dump().values())
+    assert not any(load_scene(QUICK).rig.faults.model_dump().values())
+
+
+def test_a_scanned_object_differs_from_the_object_by_the_scanners_errors() -> None:
+    world = World(load_scene(QUICK, faults=True))
+    exact, scan = world.object.mesh, world.scan
+    assert scan.is_watertight
+    assert abs(len(scan.vertices) / 1600 - 1) < 0.03
+    assert abs((scan.volume / exact.volume) ** (1 / 3) - 1) * 18 < 0.15
+    assert hat_basis(exact, scan).shape[1] == len(scan.vertices)
+
+
+def test_the_true_calibration_is_the_actual_rig() -> None:
+    """Cameras and beams of the truth that the budget uses are the twin's own, up to each mirror move's own error."""
+    rig = load_scene(QUICK, faults=True).rig
+    actual = actual_rig(rig, 3)
+    true = true_calibration(rig, actual, nominal_calibration(rig, lars3_sensor(rig)))
+    for view in range(len(true.views)):
+        camera = actual.camera(*divmod(view, true.n_angles))
+        np.testing.assert_allclose(true.view_camera(view).pose, camera.pose)
+        np.testing.assert_allclose(true.view_camera(view).focal, camera.focal)
+    aims = [Aim(angle, 1000 + 90 * angle, 2000) for angle in range(3)]
+    for mine, its in zip(true.spot_rays(aims), actual.spot_rays(aims), strict=True):
+        np.testing.assert_allclose(mine, its, atol=1e-3)
+
+
+def test_each_variant_replaces_its_own_part_only() -> None:
+    rig = load_scene(QUICK, faults=True).rig
+    own = nominal_calibration(rig, lars3_sensor(rig))
+    own = own.model_copy(
+        update={"views": tuple(v.model_copy(update={"radiance_factor": (1.1, 1.0, 0.9)}) for v in own.views)}
+    )
+    true = true_calibration(rig, actual_rig(rig, 3), nominal_calibration(rig, lars3_sensor(rig)))
+    light, pose, projector = (VARIANTS[f"true {x}"](own, true) for x in ("photometric", "pose", "projector"))
+    assert light.views[0].radiance_factor == true.views[0].radiance_factor
+    assert light.views[0].object_to_camera == own.views[0].object_to_camera
+    assert light.projectors == pose.projectors == own.projectors
+    assert pose.views[0].radiance_factor == (1.1, 1.0, 0.9)
+    assert pose.views[0].object_to_camera == true.views[0].object_to_camera
+    assert projector.projectors == true.projectors
+    assert projector.views == own.views
+
+
+def test_a_run_that_was_not_calibrated_has_no_budget(tmp_path: Path) -> None:
+    scene = load_scene(QUICK)
+    folder = RunFolder(tmp_path)
+    folder.work.mkdir()
+    nominal_calibration(scene.rig, lars3_sensor(scene.rig)).save(folder.work / "calibration.json")
+    with pytest.raises(InputError, match="--faults"):
+        score_budget(World(scene), folder, "default")
