@@ -30,7 +30,7 @@ from pipeline.calibrate.calibration import (
 )
 from pipeline.calibrate.camera import PinholeCamera, turn
 from pipeline.calibrate.intrinsics import Intrinsics, board_pose, find_corners, fit_intrinsics
-from pipeline.calibrate.peaks import Peak, brightness, find_peak, seen
+from pipeline.calibrate.peaks import Peak, brightness, find_peak, footprint, seen
 from pipeline.calibrate.photometric import Balance, balance, pixel_areas
 from pipeline.calibrate.pose import PoseFit, fit_poses
 from pipeline.calibrate.projector import TwoMirrorProjector
@@ -46,6 +46,7 @@ log = logging.getLogger(__name__)
 
 PLATE_DISTANCE_MM = 2.0  # how well a ruler knows the plate's distance from the projector
 FALSE_STEPS = 60.0  # a spot that a matrix misses by more is false
+SHIFT_MODEL = 0.2  # share of a peak's shift that does not follow the model
 PATCH_MM = 10.0  # within which the object moves the peaks of spots alike
 PLATE_SPOT_MM = 0.05  # how well a spot's place on the white plate is seen
 
@@ -295,13 +296,21 @@ def measure_projector(
         raise DiscoError("no camera sees any spot. Remedy: check that the laser reaches the object")
     place, normal, eye, spot = (np.concatenate(x) for x in (places, normals, eyes, spots))
     steps = np.array([(plan.spots[s].u, plan.spots[s].v) for s in spot], float)
+    of_angle = np.array([plan.spots[s].angle for s in spot])
     group = np.unique(np.concatenate(patches), return_inverse=True)[1]
     first = float(np.deg2rad(rig.turntable_angles_deg[0]))
     nominal = TwoMirrorProjector.from_config(rig.projector).seen_from(turn(first))
     true = projection(place, steps, FALSE_STEPS, np.random.default_rng(0)).inliers
     fit = refine(nominal, place[true], steps[true], normal[true], eye[true], size, group[true])
-    # A matrix from a few noisy spots is a coarse sieve; the model itself says better which sightings are true.
-    true = np.linalg.norm(fit.misses(place, steps, normal, eye), axis=1) < GATE * fit.rms_mm
+    # A matrix from a few noisy spots is a coarse sieve; the model itself says better which sightings are true. It also
+    # says how the beam lies on the surface, and so where the light's centroid is beside the axis.
+    origin, way = fit.projector.rays(steps)
+    turns = np.stack(poses.turns)[of_angle]
+    back_origin = np.einsum("nji,nj->ni", turns[:, :3, :3], origin - turns[:, :3, 3])
+    back_way, back_eye = (np.einsum("nji,nj->ni", turns[:, :3, :3], x) for x in (way, eye))
+    axis, centroid, whole = footprint(mesh, back_origin, back_way, back_eye, rig.projector.beam_diameter_mm / 2)
+    place = place - np.where(whole[:, None], np.einsum("nij,nj->ni", turns[:, :3, :3], centroid - axis), 0.0)
+    true = whole & (np.linalg.norm(fit.misses(place, steps, normal, eye), axis=1) < GATE * fit.rms_mm)
     log.info("projector: %d of %d sightings of %d images agree", int(true.sum()), len(spot), len(found.peaks))
     fit = refine(nominal, place[true], steps[true], normal[true], eye[true], size, group[true])
     fit = replace(fit, false=~true, images=len(found.peaks), sightings=len(spot))
@@ -309,10 +318,15 @@ def measure_projector(
 
 
 def with_pose_error(fit: ProjectorFit, poses: PoseFit, view: int) -> ProjectorFit:
-    """The same with the error of the object's rotation before the camera that saw most spots, which it shares."""
+    """The same with what its own residuals cannot show.
+
+    It shares the error of the object's rotation before the camera that saw most spots; and a peak's shift is only nearly
+    linear in the directions, which moves all spots alike.
+    """
     to_projector = fit.projector.pose[:3, :3] @ poses.views[view].pose[:3, :3].T
     covariance = fit.covariance.copy()
     covariance[:3, :3] += to_projector @ np.diag(poses.rotation[view] ** 2) @ to_projector.T
+    covariance[3:5, 3:5] += (SHIFT_MODEL * float(np.abs(fit.shift).max())) ** 2 * np.eye(2)
     return replace(fit, covariance=covariance)
 
 

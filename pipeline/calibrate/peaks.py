@@ -6,19 +6,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
+from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 F64 = NDArray[np.float64]
 
-HALF = 0.5  # of the peak: what lies above it around the peak is the spot
+ABOVE = 0.35  # of the peak: what lies above it around the peak is the spot
 LARGEST = 5.0  # times the beam's cross-section: an oblique beam on a translucent surface, but not a glow
 FAINTEST = 0.08  # of the camera's bright spots, per watt: what an edge of the object glows with is fainter
 
 
 @dataclass(frozen=True)
 class Peak:
-    """pixel: (2,) x, y of the centroid of all above half the peak; value: its radiance; size: pixels above half."""
+    """pixel: (2,) x, y of the light's centroid; value: the peak's radiance; size: pixels of the spot."""
 
     pixel: F64
     value: float
@@ -31,10 +33,10 @@ def find_peak(image: NDArray[np.floating]) -> Peak:
     smooth = ndimage.median_filter(np.asarray(image, np.float64), 3, mode="nearest")
     top = np.unravel_index(int(smooth.argmax()), smooth.shape)
     value = float(smooth[top])
-    labels, _ = ndimage.label(smooth > HALF * value)
+    labels, _ = ndimage.label(smooth > ABOVE * value)
     spot = labels == labels[top] if labels[top] else smooth >= value
     rows, columns = np.nonzero(spot)
-    weight = np.maximum(np.asarray(image, np.float64)[rows, columns] - HALF * value, 0.0) + 1e-300
+    weight = np.maximum(np.asarray(image, np.float64)[rows, columns], 0.0) + 1e-300  # as light falls: see `footprint`
     pixel = np.array([(weight * (columns + 0.5)).sum(), (weight * (rows + 0.5)).sum()]) / weight.sum()
     last = np.array(image.shape) - 1
     at_border = bool(rows.min() == 0 or columns.min() == 0 or rows.max() == last[0] or columns.max() == last[1])
@@ -60,3 +62,32 @@ def seen(peaks: Sequence[Peak], power: F64, beam_px: float, bright: float) -> ND
     small = size <= LARGEST * np.pi / 4 * max(beam_px, 2.0) ** 2
     inside = np.array([not p.at_border for p in peaks], bool)
     return np.asarray(small & inside & (value > FAINTEST * bright))
+
+
+def footprint(
+    mesh: trimesh.Trimesh, origins: F64, ways: F64, eyes: F64, radius: float
+) -> tuple[F64, F64, NDArray[np.bool_]]:
+    """Where beams of a width meet a curved surface, as a camera weighs it: (N, 3) axis, (N, 3) centroid, (N,) all hit.
+
+    origins, ways: (N, 3) beams' axes, mm; eyes: (N, 3) unit, towards the camera. On a surface seen or lit obliquely the
+    light's centroid in the image is not where the axis meets the surface; the difference is made tangential.
+    """
+    rings = [(0.0, 0.0)] + [(r, a) for r, n in ((0.5, 6), (0.85, 12)) for a in 2 * np.pi * np.arange(n) / n]
+    side = np.cross(ways, np.eye(3)[np.abs(ways).argmin(axis=1)])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    other = np.cross(ways, side)
+    start = np.stack([origins + radius * r * (np.cos(a) * side + np.sin(a) * other) for r, a in rings], axis=1)
+    count = len(rings)
+    flat_place = np.full((len(origins) * count, 3), np.nan)
+    flat_normal = np.zeros_like(flat_place)
+    hit, ray, face = RayMeshIntersector(mesh).intersects_location(
+        start.reshape(-1, 3), np.repeat(ways, count, axis=0), multiple_hits=False
+    )
+    flat_place[ray], flat_normal[ray] = hit, mesh.face_normals[face]
+    place, normal = flat_place.reshape(-1, count, 3), flat_normal.reshape(-1, count, 3)
+    good = np.isfinite(place).all(axis=(1, 2))
+    weight = np.maximum(np.einsum("nkd,nd->nk", normal, eyes), 0.0) + 1e-12
+    centroid = (weight[..., None] * place).sum(axis=1) / weight.sum(axis=1, keepdims=True)
+    off, flat = centroid - place[:, 0], normal[:, 0]
+    facing = np.maximum((eyes * flat).sum(axis=1, keepdims=True), 0.1)
+    return place[:, 0], place[:, 0] + off - (off * flat).sum(axis=1, keepdims=True) / facing * eyes, good

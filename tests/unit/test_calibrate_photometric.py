@@ -12,7 +12,7 @@ from disco_twin.object.scanner import LARGEST_MM, NOISE_MM, geometry_error, scan
 from hw.errors import InputError
 from pipeline.calibrate.camera import PinholeCamera
 from pipeline.calibrate.geometry import reconstruct_surface
-from pipeline.calibrate.peaks import brightness, find_peak, seen
+from pipeline.calibrate.peaks import brightness, find_peak, footprint, seen
 from pipeline.calibrate.photometric import balance, pixel_areas
 from pipeline.calibrate.response import linearised, response_curve
 
@@ -131,3 +131,19 @@ def test_the_scanner_errs_as_the_thesis_says() -> None:
     near = np.linalg.norm(points - points[0], axis=1)
     at = np.argmin(np.abs(near - 10.0))
     assert np.mean(errors[:, 0] * errors[:, at]) / 0.01 == pytest.approx(np.exp(-1.0), abs=0.35)
+
+
+def test_the_footprint_of_an_oblique_beam_leans() -> None:
+    """On a plane the centroid is the axis; on a sphere lit at 45 degrees it lies where the beam's rays meet it sooner."""
+    plane = trimesh.creation.box((100.0, 100.0, 2.0))
+    way = np.array([[np.sqrt(0.5), 0.0, -np.sqrt(0.5)]])
+    eye = np.array([[0.0, 0.0, 1.0]])
+    axis, centroid, whole = footprint(plane, -50.0 * way, way, eye, 1.0)
+    assert whole.all()
+    np.testing.assert_allclose(centroid, axis, atol=1e-6)
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=18.0)
+    target = np.array([[0.0, 0.0, 18.0]])
+    axis, centroid, _ = footprint(ball, target - 50.0 * way, way, eye, 1.0)
+    assert 0.01 < np.linalg.norm(centroid - axis) < 0.1
+    missed = footprint(ball, target - 50.0 * way + [0.0, 17.9, 0.0], way, eye, 1.0)[2]
+    assert not missed.any()
