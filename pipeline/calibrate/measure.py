@@ -320,8 +320,8 @@ def measure_projector(
 def with_pose_error(fit: ProjectorFit, poses: PoseFit, view: int) -> ProjectorFit:
     """The same with what its own residuals cannot show.
 
-    It shares the error of the object's rotation before the camera that saw most spots; and a peak's shift is only nearly
-    linear in the directions, which moves all spots alike.
+    It shares the error of the object's rotation before the camera that saw most spots; and a peak's shift is only
+    nearly linear in the directions, which moves all spots alike.
     """
     to_projector = fit.projector.pose[:3, :3] @ poses.views[view].pose[:3, :3].T
     covariance = fit.covariance.copy()

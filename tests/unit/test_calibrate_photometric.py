@@ -134,7 +134,7 @@ def test_the_scanner_errs_as_the_thesis_says() -> None:
 
 
 def test_the_footprint_of_an_oblique_beam_leans() -> None:
-    """On a plane the centroid is the axis; on a sphere lit at 45 degrees it lies where the beam's rays meet it sooner."""
+    """On a plane the centroid is the axis; on a sphere lit at 45 degrees it lies beside it."""
     plane = trimesh.creation.box((100.0, 100.0, 2.0))
     way = np.array([[np.sqrt(0.5), 0.0, -np.sqrt(0.5)]])
     eye = np.array([[0.0, 0.0, 1.0]])
