@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
@@ -123,7 +124,7 @@ def probe(file: DevicesFile, scene: RigConfig | None, logs: Path | None = None) 
 
     for index, device in enumerate(file.lasers):
         if device.port != EMULATED:
-            yield _try(f"laser {device.wavelength_nm:g} nm", lambda index=index: laser(index))  # type: ignore[misc]
+            yield _try(f"laser {device.wavelength_nm:g} nm", partial(laser, index))
     if file.board.port != EMULATED:
         yield _try("mirror board", board)
     if file.turntable.port != EMULATED:
@@ -131,7 +132,7 @@ def probe(file: DevicesFile, scene: RigConfig | None, logs: Path | None = None) 
     if file.power_meter is not None and file.power_meter.port != EMULATED:
         yield _try("power meter", lambda: f"reads {1e3 * _metered(connect):.3f} mW")
     for device_, shape in _shapes(file, scene):
-        yield _try(f"camera {device_.name}", lambda d=device_, s=shape: _camera_says(file, d, s))  # type: ignore[misc]
+        yield _try(f"camera {device_.name}", partial(_camera_says, file, device_, shape))
 
 
 def _metered(connect: Connector) -> float:
@@ -151,7 +152,7 @@ def selftest(file: DevicesFile, scene: RigConfig | None, armed: bool, logs: Path
     if file.turntable.port != EMULATED:
         yield _try("turntable", lambda: _test_table(connect))
     for device, shape in _shapes(file, scene):
-        yield _try(f"camera {device.name}", lambda d=device, s=shape: _test_camera(file, d, s))  # type: ignore[misc]
+        yield _try(f"camera {device.name}", partial(_test_camera, file, device, shape))
     if file.board.port == EMULATED:
         return
     try:
@@ -168,9 +169,9 @@ def selftest(file: DevicesFile, scene: RigConfig | None, armed: bool, logs: Path
             if laser.port == EMULATED:
                 continue
             if armed:
-                yield _try(name, lambda index=index: _test_laser(connect, board, index))  # type: ignore[misc]
+                yield _try(name, partial(_test_laser, connect, board, index))
             else:
-                yield _try(name, lambda index=index: _test_off(connect, index))  # type: ignore[misc]
+                yield _try(name, partial(_test_off, connect, index))
     finally:
         board.close()
 

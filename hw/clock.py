@@ -38,3 +38,32 @@ class VirtualClock:
     def sleep(self, seconds: float) -> None:
         """Move on at once."""
         self._now += max(0.0, seconds)
+
+
+class Timebase(Protocol):
+    """The clock that the capture's record is written by."""
+
+    def restart(self) -> None:
+        """The rig is ready: this is time 0."""
+
+    def now(self) -> float: ...
+    def resume_at(self, time_s: float) -> None: ...
+
+
+class Elapsed:
+    """Seconds on a clock since the rig was ready; an interrupted capture goes on from its last image's time."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock, self._start = clock, clock.now()
+
+    def restart(self) -> None:
+        """Time 0 is now."""
+        self._start = self._clock.now()
+
+    def now(self) -> float:
+        """Seconds since then."""
+        return self._clock.now() - self._start
+
+    def resume_at(self, time_s: float) -> None:
+        """Now is `time_s`."""
+        self._start = self._clock.now() - time_s

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol, Self, TypeVar
 
-from hw.clock import Clock
+from hw.clock import Clock, Elapsed, Timebase
 from hw.devices.mm_ard import ADC_TOP
 from hw.devices.turning import Table
 from hw.errors import DeviceFault, DiscoError, Refused, SwitchedOff
@@ -52,35 +52,6 @@ class Board(Protocol):
     def shut(self) -> None: ...
     def counts(self, pin: int) -> int: ...
     def close(self) -> None: ...
-
-
-class Timebase(Protocol):
-    """The clock that the capture's record is written by."""
-
-    def restart(self) -> None:
-        """The rig is ready: this is time 0."""
-
-    def now(self) -> float: ...
-    def resume_at(self, time_s: float) -> None: ...
-
-
-class Elapsed:
-    """Seconds on a clock since the rig was ready; an interrupted capture goes on from its last image's time."""
-
-    def __init__(self, clock: Clock) -> None:
-        self._clock, self._start = clock, clock.now()
-
-    def restart(self) -> None:
-        """Time 0 is now."""
-        self._start = self._clock.now()
-
-    def now(self) -> float:
-        """Seconds since then."""
-        return self._clock.now() - self._start
-
-    def resume_at(self, time_s: float) -> None:
-        """Now is `time_s`."""
-        self._start = self._clock.now() - time_s
 
 
 @dataclass(frozen=True)

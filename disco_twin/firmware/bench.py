@@ -62,7 +62,7 @@ class Bench:
         self.hazards: list[str] = []
         twin.power = EmittedPower(twin.power, self._share)
 
-    # ---- the timebase of the record (hw.rig.Timebase)
+    # ---- the timebase of the record (hw.clock.Timebase)
 
     def restart(self) -> None:
         """The rig is ready: the twin starts at time 0."""

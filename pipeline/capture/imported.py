@@ -171,16 +171,19 @@ def _row(path: Path, line: int, row: dict[str, str], described: CaptureDescripti
     laser = _nearest(number("laser_nm", "nm"), [la.wavelength_nm for la in rig.lasers], WAVELENGTH_NM, math.inf)
     if laser is None:
         raise wrong("laser_nm", ", ".join(f"{la.wavelength_nm:g}" for la in rig.lasers))
-    steps, top = [], rig.projector.steps - 1
-    for column in ("u", "v"):
-        step = number(column, f"0 to {top}")
-        if step != int(step) or not 0 <= step <= top:
+    top = rig.projector.steps - 1
+
+    def step(column: str) -> int:
+        value = number(column, f"0 to {top}")
+        if value != int(value) or not 0 <= value <= top:
             raise wrong(column, f"whole steps, 0 to {top}")
-        steps.append(int(step))
+        return int(value)
+
+    u, v = step("u"), step("v")
     power = number("power_w", "watts on the object, more than 0")
     if power <= 0:
         raise wrong("power_w", "watts on the object, more than 0")
-    return (camera, angle, *steps, laser), Frame(line, frame.file, exponent, power, frame.time_s)  # type: ignore[return-value]
+    return (camera, angle, u, v, laser), Frame(line, frame.file, exponent, power, frame.time_s)
 
 
 def _nearest(value: float, choices: tuple[float, ...] | list[float], tolerance: float, period: float) -> int | None:
