@@ -18,7 +18,7 @@ from twins import beam, block, camera, escaped, twin
 from disco_twin.light.importance import STEEPEST, Splitting, diffusion, window_targets
 from disco_twin.light.sources import opaque3, to_float
 from disco_twin.light.splitting import Window
-from disco_twin.light.transport import Transport
+from disco_twin.light.transport import Lobe, Transport
 
 F64 = NDArray[np.float64]
 REPLICATES = 32
@@ -54,32 +54,54 @@ def test_splitting_is_unbiased(kind: str, g: float) -> None:
     assert here[:, dark].var(axis=0).sum() * few < 0.25 * there[:, dark].var(axis=0).sum() * many
 
 
-def test_any_map_is_unbiased() -> None:
-    """Rationale: the windows' targets must not matter for the mean, whatever they are.
-
-    Expected behaviour: with targets drawn at random over three decades, cell by cell, the exact reflectance of a
-    half-space, and launched power is accounted for.
-    """
-    transport = Transport(half_space(1.3, (0.9, 0.99, 0.999)))
+def random_window(transport: Transport, low: float, high: float, exponents: tuple[float, float]) -> None:
+    """Let every trace with windows use targets drawn at random, cell by cell, on the cube from `low` to `high` mm."""
     cells = 24
-    targets = 10 ** np.random.default_rng(3).uniform(-2, 0.7, cells**3)
-    low, high = np.array([-4.0, -4.0, -6.0]), np.array([4.0, 4.0, 2.0])
+    targets = 10 ** np.random.default_rng(3).uniform(*exponents, cells**3)
 
     def window(*_: object) -> Window:
         return Window(
             target=to_float(targets),
             maps=dr.zeros(mi.UInt32, REPLICATES),
             cells=cells,
-            low=opaque3(mi.Point3f, low),
-            inverse_cell=dr.opaque(mi.Float, cells / float((high - low)[0])),
+            low=opaque3(mi.Point3f, np.full(3, low)),
+            inverse_cell=dr.opaque(mi.Float, cells / (high - low)),
         )
 
     transport._window = window  # type: ignore[method-assign]
+
+
+def test_any_map_is_unbiased() -> None:
+    """Rationale: the windows' targets must not matter for the mean, whatever they are.
+
+    Expected behaviour: with targets drawn at random over three decades, the exact reflectance of a half-space, and
+    launched power is accounted for.
+    """
+    transport = Transport(half_space(1.3, (0.9, 0.99, 0.999)))
+    random_window(transport, -4.0, 4.0, (-2.0, 0.7))
     make = beam(REPLICATES)
     traced = transport.trace(make, REPLICATES, 4_000, seed=82, deposit=True, split=Splitting(np.zeros((REPLICATES, 3))))
     assert traced.deposits is not None
     assert_z(z_of_replicates(traced.deposits.sum(axis=2), HALF_SPACE[1.3][:3]))
     assert np.abs(traced.balance.residual).max() < 1e-5
+
+
+def test_copies_remember_their_last_collision() -> None:
+    """Rationale: an exit shares its path with the lobe connection of the flight's last collision; a copy that forgot it
+    would count both in full.
+
+    Expected behaviour: images of a body whose photons are split at random everywhere, in total those of plain exits.
+    """
+    obj = bumpy(g=0.8)  # lobes and flights often point the same way
+    views = [camera(place, 13.0, 24) for place in VIEWS]
+    totals = []
+    for lobe, split, walks in ((None, Splitting(ENTRY), 6_000), (Lobe(100.0, 0.0, 0.0), None, 12_000)):
+        transport = Transport(obj, cells=64, lobe=lobe)
+        random_window(transport, -7.0, 7.0, (-2.0, -0.5))
+        traced = transport.trace(beam(REPLICATES, **SPOT), REPLICATES, walks, seed=86, cameras=views, split=split)
+        assert traced.images is not None
+        totals.append(traced.images[:, 0, :, 0].astype(float).sum(axis=(-1, -2)))
+    assert_z(z_of_difference(*totals), "cameras")
 
 
 def test_half_space_with_windows() -> None:
