@@ -14,7 +14,7 @@ import struct
 import zlib
 from dataclasses import dataclass
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 IMAGES_MAGIC = b"DISCOIMG"
 JOURNAL_MAGIC = b"DISCOJRN"
 
