@@ -184,7 +184,7 @@ def unexplained(samples: Samples, basis: Harmonics, range_mm: float) -> F64:
     used = samples.spots.transmitted > 0
     to_spots = samples.lit[np.flatnonzero(used)]
     cross = to_spots @ covariance  # (S, V)
-    noise = (ANGULAR / NEAR) ** 2
+    noise = (ANGULAR / FAR) ** 2  # far from the spots; near them next to nothing is left open in any case
     gain = np.linalg.solve(cross @ to_spots.T + noise * np.eye(len(cross)), cross)
     explained = (cross * gain).sum(axis=0) / np.diag(covariance)
     share = np.abs(gain) / np.maximum(np.abs(gain).sum(axis=0), 1e-12)
