@@ -218,13 +218,13 @@ def _read(
 ) -> None:
     """Image number i of a part: every step before the next image, while it is in the cache."""
     sight, scale = part.task.sight, part.scale[i]
-    index = raw.exponent[sight.window].astype(np.uint32)
-    index <<= np.uint32(sensor.bits)
+    index = raw.exponent[sight.window].astype(np.min_scalar_type(len(table[0]) - 1))
+    index <<= index.dtype.type(sensor.bits)
     index |= raw.charge[sight.window]
     place = index.astype(np.intp)
-    radiance, variance = (values.take(place, mode="clip") for values in table)  # in range: see `_record`
-    radiance *= np.float32(scale)
-    variance *= np.float32(scale**2)
+    # Scaling the tables is less work than scaling the images; all places are in range, as `_record` has seen to.
+    radiance = (table[0] * np.float32(scale)).take(place, mode="clip")
+    variance = (table[1] * np.float32(scale**2)).take(place, mode="clip")
     for way, operator in sight.operators.items():
         part.value[way][i] = operator @ radiance.reshape(-1)
     full = None
