@@ -32,6 +32,7 @@ CLIENTS := $(VENV)/.clients
 $(CLIENTS): $(READY)
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[clients]'
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[luxx]'
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[genicam]'
 	@touch $@
 
 demo: $(READY)
