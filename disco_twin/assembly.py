@@ -54,6 +54,10 @@ class LimitedBoard:
     board: MirrorBoard
     limits: tuple[tuple[int, int], tuple[int, int]]
 
+    def when_lost(self, action: Callable[[], None]) -> None:
+        """What to do when an answer was lost."""
+        self.board.when_lost(action)
+
     def set_mirrors(self, u: int, v: int) -> None:
         """Refused outside the limits."""
         for name, value, (low, high) in zip("uv", (u, v), self.limits, strict=True):

@@ -176,6 +176,10 @@ class TwinLaser:
         if self.rig.scene.gate == self.index:
             self.rig.alter(gate=-1)
 
+    def darken(self) -> None:
+        """A simulated gate shuts at once."""
+        self.close_gate()
+
 
 @dataclass
 class TwinProjector:

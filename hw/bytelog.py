@@ -7,12 +7,15 @@ driver must then send the same bytes, and gets the answers that were recorded.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from hw.clock import VirtualClock
 from hw.errors import DiscoError, InputError
+
+log = logging.getLogger(__name__)
 
 HEADER = "disco-twin byte log, format_version 1"
 MARKS = ("open", ">", "<", "!", "close")
@@ -31,10 +34,13 @@ class Event:
 
 
 class ByteLog:
-    """Appends to a file, line by line, flushed: it is complete up to the moment of a crash."""
+    """Appends to a file, line by line, flushed: it is complete up to the moment of a crash.
+
+    A log that cannot be written any more (a full disk) says so once and ends: the device goes on without it.
+    """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path, self._failed = path, False
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("a", encoding="ascii", buffering=1)
@@ -46,11 +52,24 @@ class ByteLog:
 
     def note(self, time_s: float, mark: str, data: bytes) -> None:
         """Add an event."""
-        self._file.write(f"{Event(time_s, mark, data)}\n")
+        if self._failed:
+            return
+        try:
+            self._file.write(f"{Event(time_s, mark, data)}\n")
+        except OSError as error:
+            self._give_up(error)
 
     def close(self) -> None:
         """End the log."""
-        self._file.close()
+        try:
+            self._file.close()
+        except OSError as error:
+            self._give_up(error)
+
+    def _give_up(self, error: OSError) -> None:
+        if not self._failed:
+            log.warning("%s: the byte log ends here (%s)", self.path, error.strerror)
+        self._failed = True
 
 
 def read_log(path: Path) -> list[Event]:

@@ -30,6 +30,8 @@ class Laser(Protocol):
         """Let light out. The rig refuses a second open gate."""
 
     def close_gate(self) -> None: ...
+    def darken(self) -> None:
+        """Tell the light to go out, without waiting for anybody's answer. Never raises."""
 
 
 @contextmanager
@@ -38,6 +40,9 @@ def gate_open(laser: Laser) -> Iterator[None]:
     try:
         laser.open_gate()
         yield
+    except BaseException:
+        laser.darken()  # a gate that does not answer keeps its closing waiting for seconds
+        raise
     finally:
         laser.close_gate()
 

@@ -16,7 +16,7 @@ from typing import Protocol, Self, TypeVar
 from hw.clock import Clock, Elapsed, Timebase
 from hw.devices.mm_ard import ADC_TOP
 from hw.devices.turning import Table
-from hw.errors import DeviceFault, DiscoError, Refused, SwitchedOff
+from hw.errors import DeviceFault, NoAnswer, Refused, SwitchedOff
 from hw.interface import Aim, Camera, Floodlight, Laser, Photodiode, Projector, Turntable
 
 log = logging.getLogger(__name__)
@@ -44,6 +44,9 @@ class Head(Protocol):
 
 class Board(Protocol):
     """The driver of mirrors, TTL lines and photodiode (`hw.devices.mm_ard.MirrorBoard`)."""
+
+    def when_lost(self, action: Callable[[], None]) -> None:
+        """What to do when an answer was lost, before anything is repeated."""
 
     def set_mirrors(self, u: int, v: int) -> None: ...
     def set_lines(self, pattern: int) -> None: ...
@@ -109,6 +112,7 @@ class SerialRig:
         self._timebase: Timebase = Elapsed(clock) if timebase is None else timebase
         self._devices: Devices | None = None
         self._pattern, self._last_open = 0, -1
+        self._opening = self._cut = False  # a gate is just being opened; the lasers were told off in a hurry
         self._aim, self._aimed = centre, False  # where the mirrors were told to stand; whether that is certain
         self.lasers: Sequence[Laser] = [GatedLaser(self, i) for i in range(len(self.wiring))]
         self.projector: Projector = Mirrors(self)
@@ -122,6 +126,8 @@ class SerialRig:
     def __enter__(self) -> Self:
         """Connect, home, then arm the lasers and wait for their emission, behind shut gates."""
         self._devices = devices = self._connect()
+        self._opening = self._cut = False
+        devices.board.when_lost(self._lost)
         try:
             devices.board.shut()
             self._pattern = 0
@@ -168,8 +174,29 @@ class SerialRig:
                 step()
             except SwitchedOff as error:
                 log.info("making the rig safe: %s", error)  # its guard was faster, and speaks up if it fails
-            except DiscoError as error:
+            except Exception as error:  # noqa: BLE001 - the steps that follow matter more
                 log.error("making the rig safe: %s", error)
+
+    def cut(self) -> None:
+        """Tell gates and lasers to go dark without waiting for answers; the rig must be entered anew then."""
+        if self._devices is None:
+            return
+        self._cut = True
+        for tell in (self._devices.board.shut_now, *(head.off_now for head in self._devices.heads)):
+            try:
+                tell()
+            except Exception as error:  # noqa: BLE001 - the others must be told
+                log.error("cutting the light: %s", error)
+        self.clock.sleep(HEARD_S)
+
+    def _lost(self) -> None:
+        """The board's answer was lost: no light while that is found out, and no opening is repeated."""
+        if self._opening:
+            self.devices().board.shut_now()
+            self.clock.sleep(HEARD_S)
+            raise NoAnswer("board", "the mirror board", "did not confirm an open gate", "check its cable")
+        if self.open_gate >= 0:
+            self.cut()
 
     @property
     def connected(self) -> bool:
@@ -231,15 +258,30 @@ class SerialRig:
 
     def open_line(self, line: int) -> None:
         """Open a gate, being certain that the mirrors stand where they were told to."""
+        if self._cut:
+            problem = "lost an answer while a gate was open: the lasers were switched off"
+            raise DeviceFault("board", "the mirror board", problem, "check its cable, then repeat the command")
         for _ in range(ATTEMPTS):
             if not self._aimed:
                 self.aim(*self._aim)
             self.require_lines()
-            self.switch(line, True)
-            if self._aimed:
+            if self._try_open(line) and self._aimed:
                 return
+            self._aimed = False
             self.switch(line, False)
         raise self._slow("open a gate")
+
+    def _try_open(self, line: int) -> bool:
+        """Once: where the answer is lost the board may have been reset, its mirrors anywhere, so it is not repeated."""
+        self._opening = True
+        try:
+            self.switch(line, True)
+        except NoAnswer as error:
+            log.warning("%s; shutting it and aiming anew", error.without_remedy)
+            return False
+        finally:
+            self._opening = False
+        return True
 
     def aim(self, u: int, v: int) -> None:
         """Mirror steps; returns when the mirrors have settled."""
@@ -303,6 +345,10 @@ class GatedLaser:
         """Shut this gate; always allowed."""
         if self.rig.open_gate == self.index:
             self.rig.switch(self.rig.wiring[self.index].gate_line, False)
+
+    def darken(self) -> None:
+        """Every gate and laser is told off; closing the gate then confirms."""
+        self.rig.cut()
 
 
 @dataclass

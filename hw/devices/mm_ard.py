@@ -7,6 +7,8 @@ for an argument (1 s), and a new beginning. Setting a value twice does no harm.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from hw.errors import DeviceRefused, Garbled, InputError, NoAnswer, WrongDevice
 from hw.serial_link import Inbox, Link, persist
 
@@ -44,6 +46,7 @@ class MirrorBoard:
         self.link = link
         self._inbox: Inbox[int] = Inbox(link, ByteFramer())
         self._owed = False  # an answer that was not waited for may still come
+        self._lost: Callable[[], None] = lambda: None
         link.clock.sleep(BOOT_S)
         self.version = self._identify()
         self.shut()
@@ -67,7 +70,11 @@ class MirrorBoard:
             self._owed = False
             return got[len(echo) :]
 
-        return persist(attempt, self._resynchronise)
+        def recover() -> None:
+            self._lost()
+            self._resynchronise()
+
+        return persist(attempt, recover)
 
     def _receive(self, size: int, command: bytes) -> bytes:
         end = self.link.clock.now() + ANSWER_S
@@ -124,6 +131,10 @@ class MirrorBoard:
         return WrongDevice(self.link.url, self.link.device, problem, remedy)
 
     # ---- what it does
+
+    def when_lost(self, action: Callable[[], None]) -> None:
+        """What to do when an answer was lost, before anything is repeated."""
+        self._lost = action
 
     def set_mirrors(self, u: int, v: int) -> None:
         """DAC values 0 .. 4095 of both axes, one after the other: the beam draws an L, so the gates must be shut."""

@@ -112,6 +112,9 @@ class FakeLaser:
         self.rig.open = -1
         self.rig.clock += 0.002
 
+    def darken(self) -> None:
+        self.rig.open = -1
+
 
 @dataclass
 class FakeTurntable:

@@ -15,6 +15,7 @@ from disco_twin.firmware.emulate import Emulation
 from disco_twin.rig import TwinRig
 from disco_twin.rig_commands import rig_file_of, selftest, served
 from disco_twin.rig_file import load_rig_file
+from hw.bytelog import ByteLog
 from hw.errors import DeviceFault, DiscoError, SwitchedOff
 from hw.interface import gate_open
 from hw.rig import Refused
@@ -269,3 +270,90 @@ def test_devices_capture_into_a_run_folder_and_nothing_simulates_over_it(
     status, said = command("quality", str(out / "capture"))
     assert status == 0 and "19/19" in said
     assert np.isfinite(len(images))
+
+
+# ---- a board that falls silent while a gate is open
+
+
+@pytest.mark.parametrize("deaf", [False, True])
+def test_light_is_gone_at_once_when_an_image_fails_before_a_silent_board(deaf: bool) -> None:
+    """Mute: it hears and does not answer; deaf: it does not even hear. The lasers must not wait for it."""
+    emulated = emulation()
+    with pytest.raises(DiscoError), emulated.serial_rig() as rig, gate_open(rig.lasers[0]):  # noqa: PT012 - a gate block
+        assert emulated.bench.light() == [0]
+        line = emulated.lines["board"]
+        line.answer_faults.extend([lambda data: []] * 99)
+        if deaf:
+            line.command_faults.extend([lambda data: b""] * 99)
+        begun, dark, sleep = emulated.clock.now(), [], emulated.clock.sleep
+
+        def watched(seconds: float) -> None:
+            sleep(seconds)
+            if not dark and not any(head.on_since for head in emulated.bench.heads):
+                dark.append(emulated.clock.now())
+
+        emulated.clock.sleep = watched  # type: ignore[method-assign]
+        raise DiscoError("the camera failed")
+    assert dark and dark[0] - begun < 0.1
+
+
+def test_an_answer_lost_in_the_light_puts_it_out_before_anything_is_repeated() -> None:
+    emulated = emulation()
+    with pytest.raises(DeviceFault), emulated.serial_rig() as rig, gate_open(rig.lasers[0]):  # noqa: PT012 - a gate block
+        emulated.lines["board"].command_faults.append(lambda data: b"")
+        begun = emulated.clock.now()
+        dark = []
+        receive = emulated.lines["laser0"].receive
+
+        def told(data: bytes) -> None:
+            receive(data)
+            if b"LOf" in data:
+                dark.append(emulated.clock.now())
+
+        emulated.lines["laser0"].receive = told  # type: ignore[method-assign]
+        rig.photodiode.read()
+    assert dark[0] - begun < 0.3  # the 0.2 s after which an answer counts as lost, and no repetition
+
+
+def test_an_opening_whose_answer_was_lost_is_not_repeated_before_aiming_anew() -> None:
+    emulated = emulation()
+    sent: list[bytes] = []
+    with emulated.serial_rig() as rig:
+        rig.projector.move(100, 200)
+        line = emulated.lines["board"]
+        receive = line.receive
+
+        def received(data: bytes) -> None:
+            sent.append(data)
+            opening = data[:4] == b"\0\0\0\x01" and data[4] & 7
+            if opening and sum(d == data for d in sent) == 1:
+                return
+            receive(data)
+
+        line.receive = received  # type: ignore[method-assign]
+        rig.lasers[0].open_gate()
+        rig.lasers[0].close_gate()
+    openings = [i for i, d in enumerate(sent) if d[:4] == b"\0\0\0\x01" and d[4] & 7]
+    assert any(d[:1] == b"\x03" for d in sent[openings[0] : openings[1]])
+
+
+def test_a_full_disk_ends_the_log_and_nothing_else(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    log = ByteLog(tmp_path / "full.log")
+    log._file.close()
+    log._file = Path("/dev/full").open("a", encoding="ascii", buffering=1)  # noqa: SIM115 - the log closes it
+    log.note(0.0, ">", b"1")
+    log.note(1.0, ">", b"2")
+    log.close()
+    assert caplog.text.count("the byte log ends here") == 1
+
+
+def test_no_failure_of_a_step_keeps_the_rig_from_being_made_safe() -> None:
+    def full() -> None:
+        raise OSError(28, "No space left on device")
+
+    emulated = emulation()
+    rig = emulated.serial_rig()
+    rig.__enter__()
+    rig.devices().board.shut_now = full  # type: ignore[method-assign]
+    rig.make_safe()
+    assert not any(head.on_since for head in emulated.bench.heads)
