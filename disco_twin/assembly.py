@@ -159,6 +159,10 @@ class FollowedHead:
         self.head.emit()
         self.bench.heads[self.index].on_since = -np.inf
 
+    def require_guard(self) -> None:
+        """The real laser's."""
+        self.head.require_guard()
+
     def require_power(self, tolerance: float) -> None:
         """The real laser's own reading."""
         self.head.require_power(tolerance)

@@ -36,6 +36,7 @@ class Head(Protocol):
     def name(self) -> str: ...
     def arm(self, power_mw: float) -> None: ...
     def emit(self) -> None: ...
+    def require_guard(self) -> None: ...
     def require_power(self, tolerance: float) -> None: ...
     def off_now(self) -> None: ...
     def force_off(self) -> None: ...
@@ -305,6 +306,11 @@ class SerialRig:
             problem = f"has its TTL lines at {found:06b} instead of {self._pattern:06b}: it was reset"
             raise DeviceFault("board", "the mirror board", problem, "check its power supply, then repeat the command")
 
+    def require_guards(self) -> None:
+        """Refuse an image while nobody would switch a laser off, or after one was: asked at every image."""
+        for head in self.devices().heads:
+            head.require_guard()
+
     def require_dark(self, what: str) -> None:
         """Refuse to move anything while laser light is let out."""
         self.devices()
@@ -335,7 +341,7 @@ class GatedLaser:
 
     def open_gate(self) -> None:
         """Let light out; refused while another gate is open."""
-        self.rig.devices()
+        self.rig.require_guards()
         if self.rig.open_gate not in (-1, self.index):
             raise Refused(f"the gate of laser {self.rig.open_gate} is open: one laser at a time")
         self.rig.opened(self.index)
@@ -383,7 +389,7 @@ class AdcPhotodiode:
 
     def read(self) -> float:
         """Watts on the object; refused when they are not those that the laser was set to."""
-        self.rig.devices()
+        self.rig.require_guards()
         laser = self.rig.last_open
         if laser < 0:
             return 0.0

@@ -17,6 +17,7 @@ from hw.bytelog import ByteLog
 from hw.clock import Clock
 from hw.errors import Garbled, NoAnswer, SwitchedOff, Unplugged
 from hw.guard import GuardClosed
+from hw.ports.protocol_guard import Serial as GuardedPort
 
 log = logging.getLogger(__name__)
 
@@ -26,6 +27,8 @@ SLICE_S = 0.02  # a port is never waited for longer at a time: the precision of 
 WRITE_TIMEOUT_S = 1.0
 HEARD_BYTES = 40
 REMEDY = "check cable and power, and the port's name in the rig file (`disco-twin rig probe` lists what answers)"
+
+GUARD_REMEDY = "see that the laser is off, then repeat the same command"
 
 if "hw.ports" not in serial.protocol_handler_packages:
     serial.protocol_handler_packages.append("hw.ports")
@@ -107,6 +110,14 @@ class Link:
     def heard(self) -> str:
         """What has come since the last question, in words: for errors about devices that speak something else."""
         return f"{self._heard!r} came" if self._heard else "nothing answered"
+
+    def require_guard(self) -> None:
+        """Refuse to go on if the port had a guard and has none any more; it takes no word to the device."""
+        port: object = self._port
+        gone = port.gone() if isinstance(port, GuardedPort) else None
+        if gone:
+            self._note("!", gone.encode())
+            raise SwitchedOff(self.url, f"the port of {self.device}", f"is closed: {gone}", GUARD_REMEDY)
 
     def close(self) -> None:
         """Give the port back and end the log; never raises, may be called twice."""

@@ -257,6 +257,10 @@ class OmicronLaser:
         self._owed.add("LOf")
         self.link.write(b"\r?LOf\r")
 
+    def require_guard(self) -> None:
+        """Refuse to go on without the guard that would switch the laser off."""
+        self.link.require_guard()
+
     def require_power(self, tolerance: float) -> None:
         """Refuse a laser whose own reading is not its set point within this share."""
         measured = self.measured_mw()

@@ -24,13 +24,14 @@ from pathlib import Path
 from serial import PortNotOpenError, SerialBase, SerialException, SerialTimeoutException
 
 import hw
-from hw.guard import READY, GuardClosed
+from hw.guard import IS_OFF, OFF_AS_STOPPED, READY, UNCONFIRMED, GuardClosed, stopped
 
 log = logging.getLogger(__name__)
 
 PREFIX = "guard://"
 START_S = 10.0  # a guard is a Python process
 END_S = 8.0  # it insists on an answer of the laser
+ENDING_S = 0.3  # from the end of its socket to its own
 
 
 class _Signals:
@@ -64,24 +65,25 @@ class _Signals:
 _SIGNALS = _Signals()
 
 
+def _hung_up(host: socket.socket) -> bool:
+    """Whether the other end is closed, though bytes that it sent may still be unread."""
+    poll = select.poll()
+    poll.register(host, 0)  # hanging up is always told
+    return bool(poll.poll(0))
+
+
 class Serial(SerialBase):
     """The program's end of a guarded port."""
 
     _host: socket.socket | None = None
     _guard: subprocess.Popen[bytes] | None = None
+    _rescued = False  # the guard was found dead or stopped, and the laser is being switched off without it
 
     def open(self) -> None:
         """Start the guard, which opens the port and says off."""
-        url = str(self.port).removeprefix(PREFIX)
-        self._host, theirs = socket.socketpair()
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(hw.__path__[0]).parent), *sys.path[1:]])}
-        shared = [theirs.fileno(), _SIGNALS.reader()]
+        self._rescued = False
+        self._host = self._start()
         _SIGNALS.guards += 1
-        command = [sys.executable, "-m", "hw.guard", url, str(self.baudrate), *map(str, shared), str(os.getpid())]
-        with theirs:
-            self._guard = subprocess.Popen(
-                command, pass_fds=shared, env=environment, stdin=subprocess.DEVNULL, start_new_session=True
-            )
         self._host.settimeout(START_S)
         try:
             said = self._host.recv(1)  # what follows READY is the laser's
@@ -93,6 +95,55 @@ class Serial(SerialBase):
             self._end()
             raise SerialException(said.decode(errors="replace") or "the guard process did not start")
         self.is_open = True
+
+    def _start(self) -> socket.socket:
+        """Start a guard, whose first word switches the laser off; our end of its socket."""
+        url = str(self.port).removeprefix(PREFIX)
+        ours, theirs = socket.socketpair()
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(hw.__path__[0]).parent), *sys.path[1:]])}
+        shared = [theirs.fileno(), _SIGNALS.reader()]
+        command = [sys.executable, "-m", "hw.guard", url, str(self.baudrate), *map(str, shared), str(os.getpid())]
+        with theirs:
+            self._guard = subprocess.Popen(
+                command, pass_fds=shared, env=environment, stdin=subprocess.DEVNULL, start_new_session=True
+            )
+        return ours
+
+    def gone(self, wait_s: float = ENDING_S) -> str | None:
+        """Why nobody guards the laser any more, or None: to be asked before every image. It is switched off then.
+
+        wait_s: how long a guard that has closed its socket is given to end, and so to say why.
+        """
+        guard, host = self._guard, self._host
+        if guard is None or host is None:
+            return "it is closed"
+        if self._rescued:
+            return "its guard process ended"
+        if guard.poll() is None:
+            if stopped(guard.pid):
+                self._rescue(guard)
+                return "its guard process was stopped, and continues so as to switch the laser off"
+            if not _hung_up(host):
+                return None
+            with contextlib.suppress(subprocess.TimeoutExpired):  # it is still switching off
+                guard.wait(wait_s)
+        if guard.returncode == OFF_AS_STOPPED:
+            return "the program was stopped (Ctrl-Z or SIGSTOP), and the laser switched off for that time"
+        if guard.returncode in (None, IS_OFF, UNCONFIRMED):
+            return "its guard has closed it: the laser was switched off, or its cable pulled"
+        status = guard.returncode
+        self._rescue(guard)
+        return f"its guard process was killed (status {status}); another one switches the laser off"
+
+    def _rescue(self, guard: subprocess.Popen[bytes]) -> None:
+        """The guard cannot act: have the laser switched off by it or by another, without waiting for that."""
+        self._rescued = True
+        log.warning("%s: its guard was stopped or killed: switching the laser off", self.port)
+        self.trip()
+        if guard.poll() is None:
+            guard.send_signal(signal.SIGCONT)
+        else:
+            self._start().close()  # it finds nobody, and insists on an answer of the laser before it ends
 
     def close(self) -> None:
         """End the guard, which switches the laser off; a second time does nothing."""
@@ -107,6 +158,8 @@ class Serial(SerialBase):
                 self._host.shutdown(socket.SHUT_RDWR)
 
     def _end(self) -> None:
+        if self._guard is not None and not self._rescued:
+            self.gone(wait_s=0.0)
         self.trip()
         if self._host is not None:
             self._host.close()
@@ -141,9 +194,9 @@ class Serial(SerialBase):
                 return b""
             data = host.recv(size)
         except OSError as error:
-            raise GuardClosed(f"its guard has closed it: {error.strerror}") from error
+            raise GuardClosed(self.gone(0.0) or f"its guard has closed it: {error.strerror}") from error
         if not data:
-            raise GuardClosed("its guard has closed it: the laser was switched off, or its cable pulled")
+            raise GuardClosed(self.gone(0.0) or "its guard has closed it")
         return data
 
     def write(self, data: bytes, /) -> int:  # type: ignore[override]
@@ -155,7 +208,7 @@ class Serial(SerialBase):
         except TimeoutError as error:
             raise SerialTimeoutException("the guard takes no bytes") from error
         except OSError as error:
-            raise GuardClosed(f"its guard has closed it: {error.strerror}") from error
+            raise GuardClosed(self.gone(0.0) or f"its guard has closed it: {error.strerror}") from error
         return len(data)
 
     def reset_input_buffer(self) -> None:

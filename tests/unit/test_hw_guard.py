@@ -20,8 +20,12 @@ from collections.abc import Iterator
 import pytest
 import serial
 
+from hw import guard
+from hw.clock import WallClock
+from hw.errors import SwitchedOff
 from hw.guard import GuardClosed
 from hw.ports.protocol_guard import Serial
+from hw.serial_link import Link
 
 LIMIT_S = 1.0  # on a busy machine; the benchmark measures the 100 ms
 
@@ -31,6 +35,7 @@ class Laser:
 
     def __init__(self, on: bool = False, deaf: int = 0) -> None:
         self.on, self.deaf, self.went_off = on, deaf, 0.0
+        self.preheats = self.refusals = 0  # questions answered so, and LOf that are refused
         self.said: list[str] = []
         self.master, self._keep = pty.openpty()  # the slave stays open, or a reconnecting program meets an error
         tty.setraw(self.master)
@@ -58,11 +63,17 @@ class Laser:
         if letters == "LOf" and self.deaf > 0:
             self.deaf -= 1
             return
+        if letters == "LOf" and self.refusals > 0:
+            self.refusals -= 1
+            os.write(self.master, b"!LOfx\r")
+            return
         if letters in ("LOn", "LOf"):
             if self.on and letters == "LOf":
                 self.went_off = time.monotonic()
             self.on = letters == "LOn"
-        status = f"{0x200 | 2 * self.on:04X}"
+        preheats = letters == "GAS" and self.preheats > 0
+        self.preheats -= preheats
+        status = f"{0x200 | 4 * preheats | 2 * self.on:04X}"
         answer = status if letters == "GAS" else ">"
         os.write(self.master, f"\0$note\r!{letters}{answer}\r".encode())
 
@@ -118,9 +129,9 @@ else:
 """
 
 
-def run(laser: Laser, how: str) -> subprocess.Popen[str]:
+def run(laser: Laser, how: str, text: str = PROGRAM) -> subprocess.Popen[str]:
     program = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, laser.port, how],
+        [sys.executable, "-c", text, laser.port, how],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert program.stdout is not None and program.stdout.readline() == "on\n"
@@ -185,6 +196,89 @@ def test_it_insists_until_the_laser_confirms() -> None:
         assert laser.deaf == 0
     finally:
         laser.close()
+
+
+@pytest.mark.parametrize("what", ["preheats", "refusals"])
+def test_a_laser_that_preheats_or_refuses_is_not_taken_for_off(laser: Laser, what: str) -> None:
+    port = opened(laser)
+    port.write(b"?GAS\r")
+    port.read(64)
+    setattr(laser, what, 4)
+    laser.said.clear()
+    port.close()
+    assert getattr(laser, what) == 0 and laser.said.count("LOf") >= 5 and laser.said[-1] == "GAS"
+
+
+STOPPED = """
+import sys
+from hw.clock import WallClock
+from hw.errors import DiscoError
+from hw.serial_link import Link
+link = Link("guard://" + sys.argv[1], 500000, "laser 635 nm", WallClock())
+link.write(b"?LOn\\r")
+link.require_guard()
+print("on", flush=True)
+sys.stdin.readline()
+try:
+    link.require_guard()
+except DiscoError as error:
+    print(error, flush=True)
+"""
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="the state of a process is read in /proc")
+@pytest.mark.parametrize("number", [signal.SIGTSTP, signal.SIGSTOP])
+def test_off_while_the_program_is_stopped_which_says_so_when_it_continues(laser: Laser, number: signal.Signals) -> None:
+    program = run(laser, "wait", STOPPED)
+    begun = time.monotonic()
+    program.send_signal(number)
+    try:
+        wait(laser, on=False)
+    finally:
+        program.send_signal(signal.SIGCONT)
+    assert laser.went_off - begun < LIMIT_S
+    said, complaint = program.communicate("\n")
+    assert "laser 635 nm is closed: the program was stopped (Ctrl-Z" in said and "Remedy" in said, complaint
+
+
+def guards_of(pid: int) -> list[int]:
+    found = subprocess.run(["ps", "-o", "pid=,args=", "--ppid", str(pid)], capture_output=True, text=True, check=True)
+    return [int(line.split()[0]) for line in found.stdout.splitlines() if "hw.guard" in line]
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_guard_that_is_killed_or_stopped_is_noticed_and_the_laser_goes_off(
+    laser: Laser, number: signal.Signals
+) -> None:
+    link = Link("guard://" + laser.port, 500000, "laser 635 nm", WallClock())
+    link.write(b"?LOn\r")
+    wait(laser, on=True)
+    link.require_guard()
+    (victim,) = guards_of(os.getpid())
+    os.kill(victim, number)
+    end = time.monotonic() + 5.0
+    while not guard.stopped(victim) and number == signal.SIGSTOP:
+        assert time.monotonic() < end
+    if number == signal.SIGKILL:
+        os.waitid(os.P_PID, victim, os.WEXITED | os.WNOWAIT)
+    with pytest.raises(SwitchedOff, match=r"laser 635 nm is closed: its guard process was (killed|stopped)"):
+        link.require_guard()
+    wait(laser, on=False)  # by the guard that continues, or by another, before anything else is asked for
+    with pytest.raises(SwitchedOff, match="its guard process ended"):
+        link.require_guard()
+    link.close()
+    assert laser.said[-1] == "GAS"
+
+
+def test_a_guard_that_is_told_to_end_switches_off_first(laser: Laser) -> None:
+    link = Link("guard://" + laser.port, 500000, "laser", WallClock())
+    link.write(b"?LOn\r")
+    wait(laser, on=True)
+    os.kill(guards_of(os.getpid())[0], signal.SIGTERM)
+    wait(laser, on=False)
+    with pytest.raises(SwitchedOff, match="its guard has closed it"):
+        link.require_guard()
+    link.close()
 
 
 def test_a_port_that_does_not_exist_is_an_error_of_opening() -> None:
