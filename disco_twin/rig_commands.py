@@ -162,18 +162,21 @@ def selftest(file: DevicesFile, scene: RigConfig | None, armed: bool, logs: Path
         return
     try:
         yield _try("mirrors", lambda: _test_mirrors(file, board))
-        yield _try("gates", lambda: _test_lines(file, board))
+        heads = {f"laser {laser.wavelength_nm:g} nm": i for i, laser in enumerate(file.lasers) if laser.port != EMULATED}
+        off = [_try(f"{name}, off", partial(_test_off, connect, index)) for name, index in heads.items()]
+        yield from off
+        if all(finding.good for finding in off):
+            yield _try("gates", lambda: _test_lines(file, board))
+        else:  # a laser that may be on must not come out
+            yield Finding("gates", False, "left shut: a laser did not say that it is off")
         yield _try("photodiode, dark", lambda: _test_dark(file, board))
-        for index, laser in enumerate(file.lasers):
-            name = f"laser {laser.wavelength_nm:g} nm"
-            if laser.port == EMULATED:
-                continue
-            if armed:
-                yield _try(name, partial(_test_laser, connect, board, index))
-            else:
-                yield _try(name, partial(_test_off, connect, index))
+        for name, index in heads.items() if armed else ():
+            yield _try(name, partial(_test_laser, connect, board, index))
     finally:
-        board.close()
+        try:
+            board.close()
+        except DiscoError as error:
+            log.warning("%s", error)
 
 
 def _test_table(connect: Connector) -> str:
@@ -225,13 +228,13 @@ def _test_dark(file: DevicesFile, board: Board) -> str:
 
 def _test_off(connect: Connector, index: int) -> str:
     with _using(connect.omicron(index)) as head:
-        return f"{head.measured_mw():.2f} mW while off (not armed: --arm lets it emit)"
+        return f"{head.measured_mw():.2f} mW while off"
 
 
 def _test_laser(connect: Connector, board: Board, index: int) -> str:
     """Emission, gate and photodiode against the set point, then off, with the gate open, against darkness."""
     file, wiring = connect.file, connect.file.lasers[index]
-    with _using(connect.omicron(index)) as head, _shut_after(board):
+    with _shut_after(board), _using(connect.omicron(index)) as head:  # left in reverse: the laser first
         head.arm(wiring.power_mw)
         head.emit()
         connect.clock.sleep(file.warm_up_s)
