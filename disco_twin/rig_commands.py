@@ -162,7 +162,8 @@ def selftest(file: DevicesFile, scene: RigConfig | None, armed: bool, logs: Path
         return
     try:
         yield _try("mirrors", lambda: _test_mirrors(file, board))
-        heads = {f"laser {laser.wavelength_nm:g} nm": i for i, laser in enumerate(file.lasers) if laser.port != EMULATED}
+        real = [i for i, laser in enumerate(file.lasers) if laser.port != EMULATED]
+        heads = {f"laser {file.lasers[i].wavelength_nm:g} nm": i for i in real}
         off = [_try(f"{name}, off", partial(_test_off, connect, index)) for name, index in heads.items()]
         yield from off
         if all(finding.good for finding in off):

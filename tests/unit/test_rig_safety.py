@@ -203,7 +203,9 @@ def test_probe_and_selftest_of_served_devices(
         assert end.value.code == 0 and said.count("ok  ") == 5 and "LuxX 532 nm, 10 mW" in said
         assert len(list((tmp_path / "logs").iterdir())) == 5
         findings = list(selftest(load_rig_file(path), None, armed=True))
-        assert all(f.good for f in findings) and len(findings) == 7
+        assert all(f.good for f in findings) and len(findings) == 10
+        names = [f.name for f in findings]  # no gate is opened before every laser has said that it is off
+        assert names.index("gates") == 1 + max(i for i, name in enumerate(names) if name.endswith(", off"))
         assert sum("own reading 10.00 mW, photodiode 10.0" in f.text for f in findings) == 3
         board = Path(path.parent, "board")
         file = path.read_text().replace(f'"{board}"', f'"{path.parent / "laser0"}"').replace("laser0", "laser9", 1)
@@ -222,6 +224,9 @@ def test_ctrl_c_in_a_selftest_does_not_go_on_to_the_next_laser(tmp_path: Path, m
     tried = []
 
     class Head:
+        def measured_mw(self) -> float:
+            return 0.0
+
         def arm(self, power_mw: float) -> None:
             tried.append(power_mw)
 
@@ -237,6 +242,18 @@ def test_ctrl_c_in_a_selftest_does_not_go_on_to_the_next_laser(tmp_path: Path, m
         with pytest.raises(KeyboardInterrupt):
             list(findings)
     assert tried == [10.0]
+
+
+def test_no_gate_is_tested_where_a_laser_may_be_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hw.devices.mm_ard.BOOT_S", 0.05)
+
+    def unreachable(self: object, index: int) -> object:
+        raise SwitchedOff("laser", "the laser", "does not answer", "none")
+
+    monkeypatch.setattr("disco_twin.assembly.Connector.omicron", unreachable)
+    with served(RIG, 3, tmp_path / "ports") as path:
+        findings = {f.name: f for f in selftest(load_rig_file(path), None, armed=False)}
+    assert not findings["gates"].good and "left shut" in findings["gates"].text
 
 
 def test_nothing_real_is_said_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
