@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 os.environ.setdefault("MPLBACKEND", "Agg")
-# A shell starts background jobs with SIGINT ignored, and programs hand that on to their children; the tests' children
-# are to take Ctrl-C as from a terminal.
+# A shell starts background jobs with SIGINT ignored, nohup with SIGHUP, and programs hand that on to their children;
+# the tests and their children are to take both as from a terminal.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
