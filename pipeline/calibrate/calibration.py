@@ -135,10 +135,14 @@ class Calibration(Strict):
         v = self.views[view]
         return _illumination(v.width, v.height, v.focal_px, v.centre_px, v.distortion, self.vignetting_exponent)
 
+    def factor(self, view: int, laser: int) -> float:
+        """What makes a camera's radiances of a laser agree with the photodiode (white balance)."""
+        factors = self.views[view].radiance_factor
+        return factors[laser] if factors else 1.0
+
     def radiance(self, raw: RawImage, view: int, laser: int) -> RadianceImage:
         """(H, W) radiance in W/(mm^2 sr) with its variance, corrected for vignetting and white balance."""
-        factors = self.views[view].radiance_factor
-        image, gain = to_radiance(raw, self.sensor, laser), (factors[laser] if factors else 1.0) / self.vignetting(view)
+        image, gain = to_radiance(raw, self.sensor, laser), self.factor(view, laser) / self.vignetting(view)
         return replace(
             image,
             radiance=(image.radiance * gain).astype(np.float32),

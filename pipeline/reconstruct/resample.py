@@ -135,7 +135,7 @@ class Part:
     value: per way, (n, rows) readings in mm^-2; NaN where an image is lost, saturated or hidden by a highlight
     alone: per way, (2, rows) noise and shot variance in mm^-4 of images of which some readings are NaN; the sums of
         noise and shot are without them
-    scale: (n,) pi / (F_t(w_i) Phi) of each image, 0 where it is lost
+    scale: (n,) pi / (F_t(w_i) Phi) of each image, times the camera's factor to the photodiode; 0 where it is lost
     saturated: pixels; hidden: readings that a highlight alone has cost
     """
 
@@ -199,13 +199,14 @@ def resample(
                 tasks.append(Task(sight, laser, some))
 
     def work(task: Task) -> Part:
-        part = Part.of(task)
+        part, view = Part.of(task), task.sight.view
         for i, address in enumerate(task.addresses):
             raw = _record(stream, address, calibration.sensor)
             if raw is None:
                 part.lost.append(address)
                 continue
-            part.scale[i] = np.pi / (transmitted[address.spot] * stream.meta(address).photodiode_w)
+            power = stream.meta(address).photodiode_w
+            part.scale[i] = np.pi * calibration.factor(view, task.laser) / (transmitted[address.spot] * power)
             _read(part, i, raw, calibration.sensor, tables[task.laser], hidden.get((task.sight.view, address.spot)))
         return part
 

@@ -110,7 +110,7 @@ class _Gathered:
     """Readings of all spots by all cameras, for one way of reading.
 
     value: (L, S, C, V) mm^-2, NaN where not observed
-    scale: (L, S, C) pi / (F_t(w_i) Phi) of the images, 0 where one is missing
+    scale: (L, S, C) what the images' radiances were multiplied with (`Part`), 0 where one is missing
     noise, shot: (L, views, V) mm^-4, variance summed over the values of a view: as the images show it, and by the
         camera's model; dark: (L, views, V) variance of an image without signal, as of radiance / F_t
     """
