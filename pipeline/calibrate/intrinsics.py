@@ -24,7 +24,8 @@ F64 = NDArray[np.float64]
 FOCAL_TOLERANCE, CENTRE_TOLERANCE, K1_TOLERANCE = 0.005, 0.008, 0.08
 LEAST_BOARDS = 6
 WINDOW = 4  # pixels around a corner that its position is fitted to
-PIXEL_BLUR = 12**-0.5  # standard deviation of a pixel's own box, in pixels
+PARTS = 4  # of a pixel, per axis, that a corner's model is averaged over
+PART_BLUR = 12**-0.5 / PARTS  # standard deviation of a part's own box, in pixels
 OUTLIER = 4.0  # a board whose corners are off by this many times the median board's is not used
 
 
@@ -76,7 +77,7 @@ def refine_corners(image: NDArray[np.floating], points: F64, board: F64) -> F64:
     """(N, 2) corners moved to where a blurred corner of the board fits the pixels around them best.
 
     The model of a corner is a product of two edges, erf(d / sqrt(2) sigma) each, with the directions that the board's
-    homography gives them and the pixel's own blur (a box of variance 1/12). Gauss-Newton in shift, contrast and level.
+    homography gives them, averaged over the parts of each pixel. Gauss-Newton in shift, contrast and level.
     """
     plane, points = board[:, :2], points.copy()
     homography, _ = cv2.findHomography(plane, points)
@@ -89,6 +90,8 @@ def refine_corners(image: NDArray[np.floating], points: F64, board: F64) -> F64:
     normal = to_board / steepness[:, :, None]  # (N, edge, 2) unit, across the two edges of a corner
     half_square = 0.45 * np.abs(plane - plane[0]).max() / (len(np.unique(np.round(plane[:, 0], 6))) - 1)
     offsets = np.stack(np.meshgrid(*(np.arange(-WINDOW, WINDOW + 1),) * 2), axis=-1).reshape(-1, 2)
+    middles = (np.arange(PARTS) + 0.5) / PARTS - 0.5
+    parts = np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2)
     size, image = np.array(image.shape[::-1]), image / np.abs(image).max()
     for _ in range(5):
         pixel = np.floor(points).astype(int)[:, None] + offsets
@@ -97,10 +100,11 @@ def refine_corners(image: NDArray[np.floating], points: F64, board: F64) -> F64:
         value = image[pixel[..., 1], pixel[..., 0]].astype(np.float64)
         across = np.einsum("nkd,nmd->nmk", normal, pixel + 0.5 - points[:, None])
         near = (inside & (np.abs(across * steepness[:, None]) < half_square).all(axis=2)).astype(np.float64)
-        edge, bell = special.erf(across / (PIXEL_BLUR * np.sqrt(2))), np.exp(-0.5 * (across / PIXEL_BLUR) ** 2)
-        bell *= np.sqrt(2 / np.pi) / PIXEL_BLUR
-        moved = -np.einsum("nmk,nkd->nmd", bell * edge[..., ::-1], normal)
-        plain = np.stack([edge.prod(axis=2), np.ones(near.shape)], axis=2) * near[..., None]
+        across = across[:, :, None] + np.einsum("nkd,pd->npk", normal, parts)[:, None]  # (N, M, parts, edge)
+        edge, bell = special.erf(across / (PART_BLUR * np.sqrt(2))), np.exp(-0.5 * (across / PART_BLUR) ** 2)
+        bell *= np.sqrt(2 / np.pi) / PART_BLUR
+        moved = -np.einsum("nmk,nkd->nmd", (bell * edge[..., ::-1]).mean(axis=2), normal)
+        plain = np.stack([edge.prod(axis=3).mean(axis=2), np.ones(near.shape)], axis=2) * near[..., None]
         contrast = _least_squares(plain, value)[:, 0]
         design = np.concatenate([contrast[:, None, None] * moved * near[..., None], plain], axis=2)
         points += np.clip(_least_squares(design, value)[:, :2], -0.5, 0.5)

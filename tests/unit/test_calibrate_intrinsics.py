@@ -37,11 +37,13 @@ def test_the_lens_of_a_full_size_camera_is_found_to_two_per_mille() -> None:
     assert np.abs(scores(found, actual)).max() < 4
 
 
-def test_a_camera_of_a_quarter_of_the_pixels_states_how_little_it_knows() -> None:
+def test_a_camera_of_a_quarter_of_the_pixels_is_known_as_well() -> None:
+    """192 x 124 pixels, 8 degrees across: reprojection at most .15 px, focal length within .2 %, and it says so."""
     found, actual = calibrated(3)
     assert found.reprojection_px < 0.15
+    assert abs(found.values[0] / actual.focal[0] - 1) < 0.002
     assert np.abs(scores(found, actual)).max() < 4
-    assert np.sqrt(found.covariance[0, 0]) / found.values[0] < 0.0025
+    assert np.sqrt(found.covariance[0, 0]) / found.values[0] < 0.001
 
 
 def off(points: np.ndarray, placement: int, seed: int) -> float:
@@ -68,23 +70,25 @@ def test_corners_lie_where_the_board_stands() -> None:
         assert depth.min() > 0
         assert np.sqrt(((placed - points) ** 2).sum(axis=1).mean()) < 0.15
     numbers = [i for i, p in enumerate(targets.placements) if p.kind == "board"]
-    assert off(corners, numbers[5], 5) < 0.06
+    assert off(corners, numbers[5], 5) < 0.03  # a twin or a model that cut corners left .04
     assert off(corners + 0.5, numbers[5], 5) > 0.5
 
 
 @pytest.mark.parametrize("broken", ["swapped axes", "wrong square"])
 def test_a_broken_stage_shows(broken: str) -> None:
-    """Swapped axes and a board that is not the one that was printed fit nothing."""
+    """Swapped axes and a board that is not the one that was printed fit far worse, or to a lens that is not there."""
     rig = faulty_rig()
     targets, images, actual = boards(3, rig, 0)
     board = targets.corners()
     found = [find_corners(image, board) for image in images[:12]]
+    nominal = PinholeCamera.from_config(rig.cameras[0])
+    good = fit_intrinsics(found, board, nominal).reprojection_px
     if broken == "swapped axes":
         found = [None if points is None else points[:, ::-1] for points in found]
     if broken == "wrong square":
         board = board * [1.0, 1.1, 1.0]
-    result = fit_intrinsics(found, board, PinholeCamera.from_config(rig.cameras[0]))
-    assert result.reprojection_px > 0.15 or np.abs(scores(result, actual)).max() > 5
+    result = fit_intrinsics(found, board, nominal)
+    assert result.reprojection_px > 10 * good or np.abs(scores(result, actual)).max() > 10
 
 
 def test_too_few_boards_are_refused_with_a_remedy() -> None:
