@@ -2,8 +2,12 @@
 
 Frames of 24 views are captured by the twin (`benchmarks.frames`), one spot an angle; the stream that is timed holds
 them over and over, as if every angle had many spots. Timed is all that a run does with an image: reading, checksum,
-decoding, radiance, readings, sums for the noise. Rounds alternate with decoding alone and with the plain computation
-of the same readings in double precision, whose deviation is told in units of a reading's noise.
+decoding, radiance, readings, sums for the noise. Rounds alternate with two yardsticks that tell how busy the machine
+is, a plain copy of as many bytes as an image has and decoding alone, and with the plain computation of the same
+readings in double precision, whose deviation is told in units of a reading's noise.
+
+`images_per_s` is by the wall clock. On a machine with other work it says how much of it was left over, and
+`images_per_cpu_s_two_cores`, two images' worth of processor seconds, is the fair figure.
 """
 
 from __future__ import annotations
@@ -41,25 +45,29 @@ def run(quick: bool = False) -> dict[str, Any]:
         rig, mesh = world.scene.rig, world.scan
         calibration = nominal_calibration(rig, lars3_sensor(rig))
         plan = repeated(folder, spots)
-        readings = [
-            {"footprint": footprint_reading(mesh, calibration.view_camera(view), ETA, MAX_VIEW_DEG)}
-            for view in range(plan.views)
-        ]
+        cpu, readings = time.process_time(), []
+        for view in range(plan.views):
+            camera = calibration.view_camera(view)
+            readings.append({"footprint": footprint_reading(mesh, camera, ETA, MAX_VIEW_DEG)})
+        cpu = (time.process_time() - cpu) / plan.views
         sights = [Sight.of(view, calibration, mesh, readings[view]) for view in range(plan.views)]
         lit = np.ones(len(plan.spots))
         figures: dict[str, list[float]] = {}
 
         def note(name: str, count: int, work: Callable[[], object]) -> None:
-            cpu, start = time.process_time(), time.perf_counter()
+            spent, start = time.process_time(), time.perf_counter()
             work()
             figures.setdefault(f"{name}images_per_s", []).append(count / (time.perf_counter() - start))
-            figures.setdefault(f"{name}cpu_ms", []).append(1e3 * (time.process_time() - cpu) / count)
+            figures.setdefault(f"{name}cpu_ms", []).append(1e3 * (time.process_time() - spent) / count)
 
         with StreamReader(folder / "repeated") as stream:
             some = [stream.plan.index(a) for a in stream.plan.addresses() if a.kind == "spot"]
             few = some[:: max(1, len(some) // 20)]
+            size = 3 * rig.cameras[0].width * rig.cameras[0].height
+            source, target = np.ones(size, np.uint8), np.empty(size, np.uint8)
             for _ in range(rounds):
                 note("", len(some), lambda: [None for _ in resample(stream, calibration, sights, lit, {})])
+                note("copy_", len(some), lambda: [np.copyto(target, source) for _ in some])
                 note("decode_", len(some), lambda: [None for _ in stream.read_many(some, usable_cores())])
                 note("plain_", len(few), lambda: [plain(stream, calibration, readings, i) for i in few])
             part = next(iter(resample(stream, calibration, sights[:1], lit, {})))
@@ -72,7 +80,12 @@ def run(quick: bool = False) -> dict[str, Any]:
         "height": rig.cameras[0].height,
         "threads": usable_cores(),
         "error_over_noise": error,
+        "set_up_cpu_s_per_view": cpu,
     }
+    own = figures["cpu_ms"]
+    figures["images_per_cpu_s_two_cores"] = [2e3 / ms for ms in own]
+    for yardstick in ("copy", "decode", "plain"):
+        figures[f"cpu_over_{yardstick}"] = [a / b for a, b in zip(own, figures[f"{yardstick}_cpu_ms"], strict=True)]
     for name, values in figures.items():
         result |= {name: statistics.median(values), f"{name}_min": min(values), f"{name}_max": max(values)}
     return {"name": "resample", "quick": quick, **result}

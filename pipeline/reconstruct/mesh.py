@@ -33,18 +33,27 @@ def first_hit(mesh: trimesh.Trimesh, origins: F64, directions: F64) -> Hits:
     triangle = np.asarray(mesh.ray.intersects_first(origins, directions), np.int64)
     barycentric, distance = np.zeros((len(triangle), 3)), np.full(len(triangle), np.inf)
     hit = np.flatnonzero(triangle >= 0)
-    a, b, c = np.moveaxis(np.asarray(mesh.triangles, np.float64)[triangle[hit]], 1, 0)
-    o, d = origins[hit], directions[hit]
+    # Per triangle, since rays are many: its normal, and the two gradients of the barycentric weights of b and c.
+    a, b, c = np.moveaxis(np.asarray(mesh.triangles, np.float64), 1, 0)
     normal = np.cross(b - a, c - a)
-    slope = (normal * d).sum(axis=1)
-    slope = np.where(np.abs(slope) > 1e-12, slope, 1e-12)
-    distance[hit] = (normal * (a - o)).sum(axis=1) / slope
-    p = o + d * distance[hit][:, None]
-    weights = np.stack([(np.cross(y - x, p - x) * normal).sum(axis=1) for x, y in ((b, c), (c, a), (a, b))], axis=1)
-    weights /= np.maximum((normal**2).sum(axis=1), 1e-300)[:, None]
-    weights = np.clip(weights, 0.0, 1.0)  # embree's edges are float32 wide
+    square = np.maximum((normal**2).sum(axis=1), 1e-300)[:, None]
+    towards_b, towards_c = np.cross(c - a, normal) / square, np.cross(normal, b - a) / square
+    own, d = triangle[hit], directions[hit]
+    to_corner, across = a[own] - origins[hit], normal[own]
+    slope = _dot(across, d)
+    distance[hit] = _dot(across, to_corner) / np.where(np.abs(slope) > 1e-12, slope, 1e-12)
+    place = d * distance[hit][:, None] - to_corner
+    weights = np.empty((len(hit), 3))
+    weights[:, 1], weights[:, 2] = _dot(towards_b[own], place), _dot(towards_c[own], place)
+    weights[:, 0] = 1.0 - weights[:, 1] - weights[:, 2]
+    np.clip(weights, 0.0, 1.0, out=weights)  # embree's edges are float32 wide
     barycentric[hit] = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
     return Hits(triangle, barycentric, distance)
+
+
+def _dot(a: F64, b: F64) -> F64:
+    """(N,) products of the rows of two (N, 3)."""
+    return np.asarray(np.einsum("ni,ni->n", a, b))
 
 
 def vertex_areas(mesh: trimesh.Trimesh) -> F64:
@@ -59,11 +68,11 @@ def interpolated_normals(mesh: trimesh.Trimesh, triangle: I64, barycentric: F64)
     Interpolated normals stand for the smooth object better than flat faces do: on a sphere of 642 vertices the error
     of F_t over an image is 0.2 % instead of 0.8 %.
     """
-    smooth = np.asarray(mesh.vertex_normals, np.float64)[mesh.faces[triangle]]
-    flat = np.asarray(mesh.face_normals, np.float64)[triangle][:, None]
+    smooth = np.asarray(mesh.vertex_normals, np.float64)[mesh.faces]
+    flat = np.asarray(mesh.face_normals, np.float64)[:, None]
     corners = np.where((smooth * flat).sum(axis=2, keepdims=True) < CREASE, flat, smooth)
-    normals = (corners * barycentric[:, :, None]).sum(axis=1)
-    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    normals = np.einsum("nkd,nk->nd", corners[triangle], barycentric)
+    return np.asarray(normals / np.sqrt(_dot(normals, normals))[:, None])
 
 
 def interpolation(mesh: trimesh.Trimesh, triangle: I64, barycentric: F64) -> sparse.csr_array:
