@@ -65,9 +65,14 @@ def run(quick: bool = False) -> dict[str, Any]:
             few = some[:: max(1, len(some) // 20)]
             size = 3 * rig.cameras[0].width * rig.cameras[0].height
             source, target = np.ones(size, np.uint8), np.empty(size, np.uint8)
+
+            def copy() -> None:
+                for _ in some:
+                    np.copyto(target, source)
+
             for _ in range(rounds):
                 note("", len(some), lambda: [None for _ in resample(stream, calibration, sights, lit, {})])
-                note("copy_", len(some), lambda: [np.copyto(target, source) for _ in some])
+                note("copy_", len(some), copy)
                 note("decode_", len(some), lambda: [None for _ in stream.read_many(some, usable_cores())])
                 note("plain_", len(few), lambda: [plain(stream, calibration, readings, i) for i in few])
             part = next(iter(resample(stream, calibration, sights[:1], lit, {})))

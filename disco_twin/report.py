@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_twin import figures
+from disco_twin import figures, report_calibration
 from disco_twin.folder import write_atomically
 
 if TYPE_CHECKING:
@@ -84,7 +84,8 @@ def write_report(data: ReportData, path: Path) -> None:
 
 def render(data: ReportData) -> str:
     """The page as HTML."""
-    sections = [_impulses(data), _relit(data), _errors(data), _reflectance(data), _costs(data), _left_out(data)]
+    parts = (_impulses, _relit, _errors, _reflectance, _calibration, _costs, _left_out)
+    sections = [part(data) for part in parts]
     name = html.escape(str(data.summary["scene"]))
     return (
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>disco-twin: {name}</title>"
@@ -197,6 +198,11 @@ def _reflectance(data: ReportData) -> str:
         "that were measured and of all entries once the model was completed, and the share that was measured.",
         "".join(parts),
     )
+
+
+def _calibration(data: ReportData) -> str:
+    text, body = report_calibration.section(data.summary["calibration"], data.wavelengths_nm)
+    return _section("Calibration", text, body)
 
 
 def _costs(data: ReportData) -> str:

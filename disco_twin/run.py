@@ -201,15 +201,15 @@ def score_stages(run: Run) -> dict[str, Any]:
     from disco_twin.score import load_scores, score_run
     from disco_twin.summary import make_summary, write_summary
 
-    stages = run.folder.stages
+    done = run.folder.stages
     for name in ("capture", "truth", "references", "pipeline"):
-        if name not in stages or not stages[name].finished:
+        if name not in done or not done[name].finished:
             raise InputError(f"the stage {name} is not finished", file=run.folder.root, remedy="disco-twin run")
     if why := stale(run.scene, run.folder, run.methods):
         remedy = f"disco-twin reconstruct --out {run.folder.root} --methods {','.join(run.methods)}"
         raise InputError(why, file=run.folder.work, key="--methods", value=",".join(run.methods), remedy=remedy)
     key = content_key(
-        *(stages[name].key for name in ("truth", "references", "pipeline")),
+        *(done[name].key for name in ("truth", "references", "pipeline")),
         list(run.methods),
         source_key("disco_twin.score"),
         source_key("pipeline.relight.scores"),
@@ -217,9 +217,8 @@ def score_stages(run: Run) -> dict[str, Any]:
     run.stage("scores", key, lambda _: score_run(run.world, run.folder, run.methods))
     made = load_results(run.folder)
     left_out = [*left_out_by_the_twin(run.world), *made.left_out]
-    summary = make_summary(
-        run.scene, run.folder, run.methods[0], stage_rows(run.folder, made.stages), load_scores(run.folder), left_out
-    )
+    stages, scores = stage_rows(run.folder, made.stages), load_scores(run.folder)
+    summary = make_summary(run.scene, run.folder, run.methods[0], stages, scores, made.calibration, left_out)
     write_summary(summary, run.folder.summary_file)
     write_report(collect(run.world, run.folder, summary), run.folder.report_file)
     return summary

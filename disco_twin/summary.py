@@ -36,9 +36,10 @@ def make_summary(
     method: str,
     stages: Sequence[dict[str, Any]],
     scores: dict[str, Any],
+    calibration: dict[str, Any],
     left_out: Sequence[dict[str, str]],
 ) -> dict[str, Any]:
-    """The summary; `scores` as `disco_twin.score.score_run` wrote them."""
+    """The summary; `scores` as `disco_twin.score.score_run` wrote them, `calibration` as the pipeline did."""
     own = scores["reflectance"].get(method, {"measured": {}, "coverage": {}}) or {"measured": None, "coverage": None}
     return {
         "format_version": FORMAT_VERSION,
@@ -47,6 +48,7 @@ def make_summary(
         "method": method,
         "stages": list(stages),
         "capture": capture_figures(folder.capture, len(scene.rig.lasers)),
+        "calibration": calibration,
         "relit": scores["relit"],
         "reflectance": {"log10_rmse_by_decade": own["measured"], "coverage_by_decade": own["coverage"]},
         "left_out": list(left_out),

@@ -53,6 +53,6 @@ class PipelineRecord(Figures):
     stages: tuple[StageFigures, ...]
     methods: dict[str, MethodFigures]
     capture: dict[str, Any]
-    calibration: dict[str, Any] = Field(default_factory=dict)  # what its measurement found; empty where it is nominal
+    calibration: dict[str, Any] = Field(default_factory=dict)  # `source`, and what its measurement found
     left_out: tuple[dict[str, str], ...]
     warnings: tuple[str, ...]

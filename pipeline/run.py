@@ -31,6 +31,7 @@ from hw.errors import DiscoError, InputError, refused_by_the_disk
 from hw.record import Sensor
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
 from pipeline.calibrate.camera import PinholeCamera
+from pipeline.calibrate.figures import figures
 from pipeline.calibrate.fresnel import Boundary
 from pipeline.calibrate.measure import has_targets, measure
 from pipeline.capture.stream import StreamReader
@@ -175,9 +176,7 @@ def run(capture: Path, work: Path, request: Request, given: Path | None = None) 
         rig = read_json(capture / "rig.json", RigFile, CAPTURE_AGAIN).rig
         sensor = read_json(capture / "sensor.json", SensorFile, CAPTURE_AGAIN).sensor
         mesh = read_scan(capture / "scan.ply")
-        calibration, calibrated = (
-            calibrate(capture, rig, sensor, mesh) if given is None else (Calibration.load(given), {})
-        )
+        calibration, calibrated = calibrate(capture, rig, sensor, mesh, given)
         calibration.save(work / "calibration.json")
     samples, statistics = gather(capture, calibration, mesh, settings, stages)
     if statistics.coverage == 0:
@@ -205,20 +204,25 @@ def run(capture: Path, work: Path, request: Request, given: Path | None = None) 
         "capture": asdict(statistics),
         "calibration": calibrated,
         "left_out": [item.row() for item in left_out],
-        "warnings": [*warnings_of(statistics), *(f"pose: {text}" for text in calibrated.get("ambiguity", ()))],
+        "warnings": [
+            *warnings_of(statistics),
+            *(f"pose: {text}" for text in calibrated.get("silhouettes", {}).get("ambiguity", ())),
+        ],
     }
     write_json(work / "pipeline.json", result)
     return result
 
 
 def calibrate(
-    capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh
+    capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh, given: Path | None
 ) -> tuple[Calibration, dict[str, Any]]:
     """From the rig's own images where there are any, else nominal; and what the stages of a measurement found."""
+    if given is not None:
+        return Calibration.load(given), {"source": "given"}
     if not has_targets(capture, rig):
-        return nominal_calibration(rig, sensor), {}
+        return nominal_calibration(rig, sensor), {"source": "nominal"}
     found = measure(capture, rig, sensor, mesh)
-    return found.calibration, found.report()
+    return found.calibration, figures(found)
 
 
 def warnings_of(statistics: SampleStatistics) -> list[str]:

@@ -72,30 +72,6 @@ class Measured:
     projector: ProjectorFit
     step_size: StepSize
 
-    def report(self) -> dict[str, object]:
-        """Figures for people and for pipeline.json: all in mm, degrees, pixels, shares."""
-        fit, poses = self.projector, self.poses
-        return {
-            "reprojection_px": [c.intrinsics.reprojection_px for c in self.cameras],
-            "boards": [len(c.intrinsics.used) for c in self.cameras],
-            "focal_error": [
-                float(np.sqrt(c.intrinsics.covariance[0, 0]) / c.intrinsics.values[0]) for c in self.cameras
-            ],
-            "power_drift": [float(x) for x in np.max([c.balance.drift for c in self.cameras], axis=0)],
-            "power_scatter": [float(x) for x in np.max([c.balance.scatter for c in self.cameras], axis=0)],
-            "silhouette_residual_px": poses.residual_px,
-            "silhouette_xor_px": list(poses.xor_pixels),
-            "pose_error_deg": float(np.rad2deg(poses.rotation.max())),
-            "pose_error_mm": [float(x) for x in poses.translation.max(axis=0)],
-            "ambiguity": list(poses.ambiguity),
-            "projector_residual_mm": fit.rms_mm,
-            "spot_images": fit.images,
-            "spot_hidden": fit.images - fit.sightings,
-            "spot_false": int(fit.false.sum()),
-            "peak_shift_mm": {"along_light": float(fit.shift[0]), "towards_camera": float(fit.shift[1])},
-            "peak_shift_error_mm": [float(x) for x in fit.shift_error],
-        }
-
 
 def has_targets(capture: Path, rig: RigConfig) -> bool:
     """Whether calibration images of every camera lie beside the capture."""

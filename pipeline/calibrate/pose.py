@@ -46,6 +46,8 @@ class PoseFit:
     along the camera's axes, and of the origin, mm; residual_px: root mean square of the edges; edges: their number
     ambiguity: directions that the silhouettes leave open, in words; empty if there is none
     xor_pixels: per view, the thesis's measure of mismatch (figure 5.1)
+    axis, axis_error: (4,) of the turntable in the object frame at the first angle: rotation vector about x and y by
+        which it departs from z (rad), x and y where it passes (mm), and their standard deviations; empty for one angle
     """
 
     views: tuple[PinholeCamera, ...]
@@ -56,6 +58,8 @@ class PoseFit:
     edges: int
     ambiguity: tuple[str, ...] = ()
     xor_pixels: tuple[int, ...] = ()
+    axis: F64 = field(default_factory=lambda: np.zeros(0))
+    axis_error: F64 = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass
@@ -321,7 +325,20 @@ def _result(
                     axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
                     ambiguity.append(f"view {v}: {what} ({axis[0]:.2f}, {axis[1]:.2f}, {axis[2]:.2f}) of the object")
     xor = tuple(int((mesh_mask(mesh, view) ^ m).sum()) for view, m in zip(views, masks, strict=True))
-    return PoseFit(tuple(views), tuple(sweep.turns()), rotation, translation, residual, edges, tuple(ambiguity), xor)
+    first = (6 + LENS) * len(sweep.lenses)
+    spread = np.sqrt(np.diag(covariance)[first : first + 4])
+    return PoseFit(
+        tuple(views),
+        tuple(sweep.turns()),
+        rotation,
+        translation,
+        residual,
+        edges,
+        tuple(ambiguity),
+        xor,
+        sweep.axis[: len(spread)],
+        spread,
+    )
 
 
 def _pose_jacobian(sweep: _Sweep, view: int) -> F64:

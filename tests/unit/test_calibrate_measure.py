@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +20,7 @@ from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.deviation import actual_rig
 from disco_twin.faults import LaserPower
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
+from pipeline.calibrate.figures import figures
 from pipeline.calibrate.measure import Measured, measure
 from pipeline.capture.plan import load_plan
 from pipeline.capture.stream import StreamReader
@@ -73,6 +76,15 @@ def judge(found: Measured, rig: RigConfig, seed: int, folder: Path) -> Judged:
     )
 
 
+def true_axis(turns: Sequence[F64]) -> tuple[F64, F64]:
+    """(2,) rotation vector from z to the axis, (2,) mm where it passes z = 0; object frame at the first angle."""
+    relative = np.linalg.inv(turns[0]) @ turns[1]
+    way = Rotation.from_matrix(relative[:3, :3]).as_rotvec()
+    way *= np.sign(way[2]) / np.linalg.norm(way)
+    point = np.linalg.lstsq(np.eye(3) - relative[:3, :3], relative[:3, 3], rcond=None)[0]
+    return np.array([-way[1], way[0]]), (point - point[2] / way[2] * way)[:2]
+
+
 def _steady(rig: RigConfig, seed: int) -> Calibration:
     actual = actual_rig(rig, seed)
     return true_calibration(rig, actual, nominal_calibration(rig, lars3_sensor(rig)))
@@ -99,10 +111,23 @@ def test_a_rig_is_calibrated_from_its_own_images(captured: tuple[Path, RigConfig
     assert judged.spots_mm < 0.15
     assert judged.incidence_deg < 0.3
     assert judged.balance < 0.0075  # speckle, and the light that the lens throws outside the image
-    report = found.report()
-    assert max(report["reprojection_px"]) < 0.15
-    assert (np.array(report["power_drift"])[1:] > 0.1).all()
-    assert (np.array(report["power_scatter"]) < 0.012).all()  # five per cent of speckle on some thirty pixels
+    report = figures(found)
+    assert json.loads(json.dumps(report, allow_nan=False)) == report
+    assert max(lens["reprojection_px"] for lens in report["lenses"]) < 0.15
+    assert (np.array(report["photometric"]["power_drift"])[1:] > 0.1).all()
+    assert (
+        np.array(report["photometric"]["power_scatter"]) < 0.012
+    ).all()  # five per cent of speckle on some thirty pixels
+    spots = report["projector"]
+    for end, shift in spots["peak_shift_mm"].items():  # as `Glowing` moves its peaks
+        assert abs(shift - 0.1) < 4 * spots["peak_shift_error_mm"][end]
+    assert 0.2 < spots["hidden"] / spots["images"] < 0.8  # one camera looks from behind
+    assert spots["used"] + spots["false"] + spots["hidden"] <= spots["images"]
+    tilt, place = true_axis(actual_rig(rig, 11).turns)
+    assert (
+        np.abs(tilt - np.deg2rad(report["axis"]["tilt_deg"])) < 4 * np.deg2rad(report["axis"]["tilt_error_deg"])
+    ).all()
+    assert (np.abs(place - report["axis"]["offset_mm"]) < 4 * np.array(report["axis"]["offset_error_mm"])).all()
     again = Calibration.model_validate_json(found.calibration.model_dump_json())
     assert again == found.calibration
     assert again.source == "measured"

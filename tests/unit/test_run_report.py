@@ -10,6 +10,7 @@ import pytest
 
 from disco_twin.figures import Comparison, Impulse
 from disco_twin.report import ReportData, render, rms, write_report
+from disco_twin.report_calibration import section
 
 METHODS = {"default": 0.06, "disco2004": 0.15, "dipole": 0.25, "lambertian": 0.6}
 LIGHTS = ("uniform", "directional", "edge", "behind", "projector", "spot", "environment")
@@ -71,6 +72,7 @@ def fake_data() -> ReportData:
             "bytes_raw": 129e6,
             "bytes_stored": 11e6,
         },
+        "calibration": {"source": "nominal"},
         "relit": rows,
         "reflectance": {
             "log10_rmse_by_decade": {d: 0.05 + 0.1 * k for k, d in enumerate(decades)},
@@ -114,7 +116,15 @@ def test_the_page_is_self_contained_and_complete(tmp_path: Path) -> None:
     assert not re.findall(r"(?:src|href)=['\"](?!data:)|https?://|url\(|<script", page)
     for light in LIGHTS:
         assert f"<h3>{light}</h3>" in page
-    for heading in ("Impulse responses", "Relit images", "Errors", "Diffuse subsurface", "Time, memory", "left out"):
+    for heading in (
+        "Impulse responses",
+        "Relit images",
+        "Errors",
+        "Diffuse subsurface",
+        "Calibration",
+        "Time, memory",
+        "left out",
+    ):
         assert heading in page
     assert page.count("<img") == len(LIGHTS) + 7
     assert "pose search" in page
@@ -135,3 +145,71 @@ def test_rms_keeps_the_sign_of_the_square() -> None:
     assert rms([3.0, 4.0]) == pytest.approx(np.sqrt(12.5))
     assert rms([-0.1]) == pytest.approx(-0.1)
     assert rms([0.1, -0.1]) == pytest.approx(0.0)
+
+
+MEASURED = {
+    "source": "measured",
+    "lenses": [
+        {
+            "camera": "front",
+            "boards": 25,
+            "reprojection_px": 0.044,
+            "focal_px": 1405.4,
+            "focal_error_px": 2.7,
+            "centre_px": [96.6, 61.5],
+            "centre_error_px": [1.2, 1.4],
+            "k1": -0.076,
+            "k1_error": 0.031,
+        }
+    ],
+    "photometric": {
+        "white_balance": {"front": [0.9915]},
+        "white_balance_error": {"front": [0.0031]},
+        "power_w": [0.00893],
+        "power_drift": [0.35],
+        "power_scatter": [0.0088],
+    },
+    "silhouettes": {"residual_px": 0.037, "edges": 2380, "xor_px": [16, 30], "ambiguity": ["rotation about <z>"]},
+    "poses": [{"camera": "front", "rotation_error_deg": 0.087, "across_error_mm": 0.43, "depth_error_mm": 0.86}],
+    "axis": {
+        "tilt_deg": [-0.011, 0.013],
+        "tilt_error_deg": [0.015, 0.012],
+        "offset_mm": [-0.08, -0.04],
+        "offset_error_mm": [0.001, 0.001],
+    },
+    "projector": {
+        "images": 180,
+        "hidden": 91,
+        "false": 3,
+        "used": 86,
+        "residual_mm": 0.039,
+        "spot_error_mm": 0.033,
+        "distance_error_mm": 1.47,
+        "direction_error_deg": 0.085,
+        "full_angle_deg": [5.9854, 6.0066],
+        "full_angle_error_deg": [0.014, 0.0145],
+        "peak_shift_mm": {"along_light": 0.089, "towards_camera": 0.102},
+        "peak_shift_error_mm": {"along_light": 0.033, "towards_camera": 0.036},
+    },
+}
+
+
+def test_the_calibration_is_told_with_its_uncertainty() -> None:
+    """Of a measured one every part; of another one why there is nothing to tell. One angle has no axis."""
+    text, body = section(MEASURED, [635.0])
+    assert "standard deviation" in text
+    for shown in (
+        "1405.4 +- 2.7 px (0.19%)",
+        "0.9915 +- 0.0031",
+        "drifted by 35%",
+        "+- 0.43 mm across, +- 0.86 mm along the axis, +- 0.087 deg",
+        "tilt -0.011 +- 0.015, 0.013 +- 0.012 deg",
+        "rotation about &lt;z&gt;",
+        "86 used, 91 hidden, 3 false",
+        "+- 0.033 mm",
+        "0.089 +- 0.033 mm along the light, 0.102 +- 0.036 mm towards the camera",
+    ):
+        assert shown in body
+    assert "axis</td><td class='text'>tilt" not in section(MEASURED | {"axis": None}, [635.0])[1]
+    assert section({"source": "nominal"}, [635.0])[1] == ""
+    assert "given as a file" in section({"source": "given"}, [635.0])[0]
