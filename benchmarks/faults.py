@@ -198,7 +198,7 @@ def _die(emulation: Emulation, state: Path) -> None:
     bench = emulation.bench
     bare = [dict(vars(device)) for device in (*bench.heads, bench.board, bench.spindle)]
     for fields in bare:
-        for name in ("sample", "on_move"):
+        for name in ("sample", "on_move", "on_lines", "on_start"):
             fields.pop(name, None)
     state.write_bytes(pickle.dumps((emulation.clock.now(), bare)))
     os.kill(os.getpid(), signal.SIGKILL)

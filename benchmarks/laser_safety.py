@@ -32,7 +32,7 @@ from disco_twin.assembly import Connector, free_line, wiring_of
 from disco_twin.firmware.emulate import Emulation
 from disco_twin.firmware.serve import Server
 from disco_twin.rig_commands import emulated_devices, rig_file_of
-from disco_twin.rig_file import load_rig_file
+from disco_twin.rig_rules import load_rig_file
 from hw.clock import WallClock
 from hw.devices.omicron_protocol import Mode
 from hw.interface import Aim
@@ -90,6 +90,7 @@ def program(rig_toml: Path, folder: Path, how: str, images: int, told: Connectio
         [wiring_of(laser) for laser in file.lasers],
         [Blink(how, images, told)],
         WallClock(),
+        armed=True,
         flood_line=file.board.floodlight_line,
         armed_line=free_line(file),
     )

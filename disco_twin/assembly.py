@@ -1,21 +1,19 @@
 """From a rig file to a rig: real devices on their ports, emulated ones on memory ports, cameras real or simulated.
 
 Emulated devices move the twin by themselves. What a real device does is told to the twin where cameras are simulated
-(`followed`), so that they see it: a real turntable turns the simulated object.
+(`disco_twin.followed`), so that they see it: a real turntable turns the simulated object.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from disco_twin.firmware.bench import Bench
-from disco_twin.firmware.turning import Spindle
+from disco_twin.followed import FollowedBoard, FollowedHead, LimitedBoard, PlacedTable, turn_twin
 from disco_twin.rig_file import EMULATED, DevicesFile, GenicamDevice, LaserDevice, SensorDevice, ZaberDevice
 from hw.bytelog import ByteLog
 from hw.clock import Clock, VirtualClock, WallClock
@@ -24,7 +22,6 @@ from hw.devices.elliptec import ElliptecTable
 from hw.devices.mm_ard import BAUD as BOARD_BAUD
 from hw.devices.mm_ard import LINES, MirrorBoard
 from hw.devices.omicron import OmicronLaser
-from hw.devices.omicron_protocol import Mode
 from hw.devices.ophir import BAUD as OPHIR_BAUD
 from hw.devices.ophir import OphirMeter
 from hw.devices.turning import Table
@@ -32,8 +29,9 @@ from hw.devices.zaber import BAUD as ZABER_BAUD
 from hw.devices.zaber import ZaberTable
 from hw.errors import DeviceFault, InputError
 from hw.interface import Camera
-from hw.rig import Board, Devices, Head, LaserWiring, SerialRig
+from hw.rig import SerialRig
 from hw.serial_link import Link
+from hw.wiring import Board, Devices, Head, LaserWiring
 from pipeline.rig import RigConfig
 
 if TYPE_CHECKING:
@@ -42,186 +40,6 @@ if TYPE_CHECKING:
     from hw.devices.genicam import GenicamCamera
 
 T = TypeVar("T")
-
-
-# ---- limits of the rig file
-
-
-@dataclass
-class LimitedBoard:
-    """A board whose mirrors stay where the rig file lets them."""
-
-    board: MirrorBoard
-    limits: tuple[tuple[int, int], tuple[int, int]]
-
-    def when_lost(self, action: Callable[[], None]) -> None:
-        """What to do when an answer was lost."""
-        self.board.when_lost(action)
-
-    def set_mirrors(self, u: int, v: int) -> None:
-        """Refused outside the limits."""
-        for name, value, (low, high) in zip("uv", (u, v), self.limits, strict=True):
-            if not low <= value <= high:
-                raise InputError(
-                    "this mirror step is outside the rig's limits",
-                    key=f"board.limits_{name}",
-                    value=value,
-                    allowed=f"{low} to {high}",
-                    remedy="widen the limits in the rig file, or aim the scene's projector so that it needs less",
-                )
-        self.board.set_mirrors(u, v)
-
-    def set_lines(self, pattern: int) -> None:
-        """The TTL lines."""
-        self.board.set_lines(pattern)
-
-    def lines(self) -> int:
-        """The TTL lines as they are."""
-        return self.board.lines()
-
-    def shut_now(self) -> None:
-        """Every line low, without waiting for the answer."""
-        self.board.shut_now()
-
-    def shut(self) -> None:
-        """Every line low."""
-        self.board.shut()
-
-    def counts(self, pin: int) -> int:
-        """The converter's value at a pin."""
-        return self.board.counts(pin)
-
-    def close(self) -> None:
-        """Shut, and give the port back."""
-        self.board.close()
-
-
-@dataclass
-class PlacedTable:
-    """A turntable whose own zero and sense of turning differ from the rig's. Angles in rad."""
-
-    table: Table
-    zero_rad: float
-    direction: int
-    told: Callable[[float], None]  # degrees of the rig, after every move
-
-    def __post_init__(self) -> None:
-        self.link = self.table.link
-
-    def home(self) -> None:
-        """Find the zero, and turn to the rig's."""
-        self.table.home()
-        self.move(0.0)
-
-    def move(self, angle_rad: float) -> None:
-        """Turn to an angle of the rig."""
-        self.table.move(self.zero_rad + self.direction * angle_rad)
-        self.told(float(np.rad2deg(angle_rad)))
-
-    def angle_rad(self) -> float:
-        """Where it stands."""
-        return self.direction * (self.table.angle_rad() - self.zero_rad) % (2 * np.pi)
-
-    def stop(self) -> None:
-        """Stop at once."""
-        self.table.stop()
-
-    def close(self) -> None:
-        """Give the port back."""
-        self.table.close()
-
-
-# ---- real devices that simulated cameras must see
-
-
-@dataclass
-class FollowedHead:
-    """A real laser; the twin's head does as it does."""
-
-    head: OmicronLaser
-    bench: Bench
-    index: int
-
-    @property
-    def name(self) -> str:
-        """What the rig calls it."""
-        return self.head.name
-
-    def arm(self, power_mw: float) -> None:
-        """Allow light of this power."""
-        self.head.arm(power_mw)
-        twin = self.bench.heads[self.index]
-        twin.level = power_mw / twin.max_power_mw
-        twin.mode = int(Mode.BIAS | Mode.RELEASE)
-
-    def emit(self) -> None:
-        """Start emission."""
-        self.head.emit()
-        self.bench.heads[self.index].on_since = -np.inf
-
-    def require_guard(self) -> None:
-        """The real laser's."""
-        self.head.require_guard()
-
-    def require_power(self, tolerance: float) -> None:
-        """The real laser's own reading."""
-        self.head.require_power(tolerance)
-
-    def off_now(self) -> None:
-        """No light, without waiting for the answer."""
-        self.bench.heads[self.index].on_since = None
-        self.head.off_now()
-
-    def force_off(self) -> None:
-        """No light."""
-        self.bench.heads[self.index].on_since = None
-        self.head.force_off()
-
-    def close(self) -> None:
-        """Switch off, and give the port back."""
-        self.bench.heads[self.index].on_since = None
-        self.head.close()
-
-
-@dataclass
-class FollowedBoard(LimitedBoard):
-    """A real board; the twin's mirrors and gates do as it does."""
-
-    bench: Bench
-
-    def set_mirrors(self, u: int, v: int) -> None:
-        """Both mirrors."""
-        super().set_mirrors(u, v)
-        for channel, value in enumerate((u, v)):
-            self.bench.board.write(channel, value, self.bench.clock.now())
-
-    def set_lines(self, pattern: int) -> None:
-        """The TTL lines."""
-        super().set_lines(pattern)
-        self.bench.board.set_pattern(pattern)
-
-    def shut_now(self) -> None:
-        """Every line low, without waiting for the answer."""
-        self.bench.board.set_pattern(0)
-        super().shut_now()
-
-    def shut(self) -> None:
-        """Every line low."""
-        self.bench.board.set_pattern(0)
-        super().shut()
-
-
-def _turn_twin(bench: Bench) -> Callable[[float], None]:
-    """The twin's object stands where a real turntable has put it."""
-
-    def told(angle_deg: float) -> None:
-        bench.spindle = Spindle(angle_deg=angle_deg, homed=True, on_move=bench.turned)
-        bench.turned(angle_deg)
-
-    return told
-
-
-# ---- putting it together
 
 
 class Connector:
@@ -284,7 +102,7 @@ class Connector:
 
         table = _opened(link, driver)
         follow = device.port != EMULATED and self._follow and self.emulation is not None
-        told = _turn_twin(self.emulation.bench) if follow and self.emulation is not None else _nobody
+        told = turn_twin(self.emulation.bench) if follow and self.emulation is not None else _nobody
         return PlacedTable(table, float(np.deg2rad(device.zero_deg)), device.direction, told)
 
     def connect(self) -> Devices:
@@ -355,9 +173,12 @@ def require_black(camera: GenicamCamera, sensor: SensorDevice) -> float:
 
 @contextmanager
 def assembled(
-    file: DevicesFile, scene: RigConfig, twin: TwinRig | None = None, logs: Path | None = None
+    file: DevicesFile, scene: RigConfig, twin: TwinRig | None = None, logs: Path | None = None, *, armed: bool
 ) -> Iterator[SerialRig]:
-    """The rig, its cameras open. `twin`: where something is emulated or simulated; its cameras are used or not."""
+    """The rig, its cameras open. `twin`: where something is emulated or simulated; its cameras are used or not.
+
+    armed: real lasers may emit. Emulated ones need no permission.
+    """
     from disco_twin.firmware.emulate import Emulation
 
     clock: Clock = VirtualClock() if file.all_emulated and file.simulated_cameras else WallClock()
@@ -382,6 +203,7 @@ def assembled(
             [wiring_of(laser) for laser in file.lasers],
             cameras,
             clock,
+            armed=armed or not file.real_lasers,
             flood_line=file.board.floodlight_line,
             armed_line=free_line(file),
             warm_up_s=file.warm_up_s,

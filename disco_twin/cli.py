@@ -71,7 +71,7 @@ def capture(
 ) -> None:
     """Scan and capture only: DIR/capture is what the pipeline reads."""
     from disco_twin.console import run_log
-    from disco_twin.rig_capture import capture_with_devices, open_rig_file
+    from disco_twin.rig_capture import capture_with_devices
     from disco_twin.run import capture_stages, open_run
 
     with naming(scene):
@@ -80,7 +80,7 @@ def capture(
             if rig is None:
                 capture_stages(opened)
             else:
-                capture_with_devices(opened, open_rig_file(opened, rig, arm), rig, logs)
+                capture_with_devices(opened, rig, logs, armed=arm)
 
 
 @app.command("import")

@@ -31,7 +31,7 @@ LogsOption = Annotated[
 def probe(rig: RigPath, scene: SceneOption = None, logs: LogsOption = None) -> None:
     """Connect to every real device and show what it is. Switches lasers off and shuts gates; nothing moves."""
     from disco_twin.rig_commands import probe as run_probe
-    from disco_twin.rig_file import load_rig_file
+    from disco_twin.rig_rules import load_rig_file
 
     _show(run_probe(load_rig_file(rig), _rig_of(scene), logs))
 
@@ -40,7 +40,7 @@ def probe(rig: RigPath, scene: SceneOption = None, logs: LogsOption = None) -> N
 def selftest(rig: RigPath, scene: SceneOption = None, arm: ArmOption = False, logs: LogsOption = None) -> None:
     """Move, expose and read back every real device. Lasers emit only with --arm."""
     from disco_twin.rig_commands import selftest as run_selftest
-    from disco_twin.rig_file import load_rig_file
+    from disco_twin.rig_rules import load_rig_file
 
     _show(run_selftest(load_rig_file(rig), _rig_of(scene), arm, logs))
 

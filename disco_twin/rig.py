@@ -19,7 +19,7 @@ from disco_twin.deviation import ActualRig, actual_rig
 from disco_twin.faults import LaserPower, Stream, generator, speckle
 from hw.devices.mm_ard import ADC_TOP
 from hw.errors import DiscoError, InputError, Refused
-from hw.interface import Aim, Camera, Floodlight, Laser, Photodiode, Projector, Turntable
+from hw.interface import Aim, Camera, Floodlight, Laser, LaserReading, Photodiode, Projector, Turntable
 from hw.record import RawImage
 from pipeline.rig import LaserConfig, RigConfig
 
@@ -110,6 +110,11 @@ class TwinRig:
     def announce(self, aims: Sequence[Aim]) -> None:
         """Let the light source work ahead."""
         self.source.prepare(aims)
+
+    def check(self) -> Sequence[LaserReading]:
+        """Simulated lasers have no reading of their own."""
+        self.require_power()
+        return ()
 
     def make_safe(self) -> None:
         """Gates shut, lasers off, floodlight off."""

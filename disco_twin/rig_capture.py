@@ -1,28 +1,27 @@
 """`disco-twin capture SCENE --rig rig.toml`: the capture by the devices of a rig file; the swap is this one word.
 
-The folder keeps the rig file, and knows by it that devices took its images: nothing simulates or removes them later.
+The folder keeps the rig file, and knows by it that devices took its images: nothing simulates or removes them later,
+and no other rig continues them.
 """
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from disco_twin.assembly import assembled
 from disco_twin.folder import content_key, write_atomically
-from disco_twin.rig_file import EMULATED, DevicesFile, load_rig_file, require_scene
+from disco_twin.rig_file import EMULATED, DevicesFile
+from disco_twin.rig_rules import load_rig_file, require_same, require_scene
 from hw.errors import InputError
-from hw.record import Sensor
 from pipeline.capture.files import IMAGES
 from pipeline.capture.loop import capture
+from pipeline.capture.stream import StreamReader
 
 if TYPE_CHECKING:
     from disco_twin.console import Report
     from disco_twin.rig import TwinRig
     from disco_twin.run import Run
-
-log = logging.getLogger(__name__)
 
 
 def open_rig_file(run: Run, path: Path, armed: bool) -> DevicesFile:
@@ -36,27 +35,40 @@ def open_rig_file(run: Run, path: Path, armed: bool) -> DevicesFile:
             file=path,
             remedy="see to interlock, door and goggles, then repeat the command with --arm",
         )
-    if (run.folder.capture / IMAGES).exists() and not run.folder.taken_by_devices:
-        raise InputError("this folder holds a simulated capture", file=run.folder.root, remedy="choose another --out")
+    folder = run.folder
+    if (folder.capture / IMAGES).exists() and not folder.taken_by_devices:
+        raise InputError("this folder holds a simulated capture", file=folder.root, remedy="choose another --out")
+    if _has_images(folder.capture):
+        require_same(file, load_rig_file(folder.devices_record), path)
     return file
 
 
-def capture_with_devices(run: Run, file: DevicesFile, path: Path, logs: Path | None) -> None:
-    """Scan and capture; continues where it was interrupted, if the rig has not moved since."""
+def _has_images(folder: Path) -> bool:
+    """Before the first image the rig file may still be corrected."""
+    if not (folder / IMAGES).exists():
+        return False
+    with StreamReader(folder) as stored:
+        return len(stored) > 0
+
+
+def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool) -> None:
+    """Scan and capture; continues where it was interrupted, if the rig is the same and has not moved since."""
     from disco_twin import simulate
 
-    world, folder = run.world, run.folder
-    sensor = None if file.sensor is None or file.simulated_cameras else file.sensor.sensor()
+    file, world, folder = open_rig_file(run, path, armed), run.world, run.folder
+    if not _has_images(folder.capture):  # what the images are begun with is kept
+        write_atomically(folder.devices_record, path.read_bytes())
+    real = None if file.sensor is None or file.simulated_cameras else file.sensor.sensor()
+    sensor = simulate.sensor_of(world, real)
     key = content_key(folder.identity, "devices")
-    run.stage("scan", key, lambda _: simulate.write_scan(world, folder.capture, sensor))
-    write_atomically(folder.devices_record, path.read_bytes())
-    run.stage("capture", key, lambda report: _take_images(run, file, simulate.sensor_of(world, sensor), logs, report),
-              "images")  # fmt: skip
+    scan_key = content_key(key, repr(sensor))  # the sensor may be corrected before the first image
+    run.stage("scan", scan_key, lambda _: simulate.write_scan(world, folder.capture, real))
 
+    def take_images(report: Report) -> None:
+        with assembled(file, run.scene.rig, _twin(run, file), logs, armed=armed) as rig:
+            capture(rig, world.plan, folder.capture, report, sensor)
 
-def _take_images(run: Run, file: DevicesFile, sensor: Sensor, logs: Path | None, report: Report) -> None:
-    with assembled(file, run.scene.rig, _twin(run, file), logs) as rig:
-        capture(rig, run.world.plan, run.folder.capture, report, sensor)
+    run.stage("capture", key, take_images, "images")
 
 
 def _twin(run: Run, file: DevicesFile) -> TwinRig | None:

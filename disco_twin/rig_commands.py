@@ -19,7 +19,8 @@ from disco_twin.rig_file import EMULATED, DevicesFile, GenicamDevice
 from hw.clock import WallClock
 from hw.errors import DeviceFault, DiscoError, InputError
 from hw.interface import Aim
-from hw.rig import Board
+from hw.rig import DARK_COUNTS
+from hw.wiring import Board
 from pipeline.rig import RigConfig
 
 if TYPE_CHECKING:
@@ -29,7 +30,6 @@ log = logging.getLogger(__name__)
 
 F32 = NDArray[np.float32]
 
-DARK_COUNTS = 8  # of the photodiode's 1023 with every gate shut
 TEST_ANGLE_DEG = 30.0
 ANGLE_TOLERANCE_DEG = 0.05
 FRAMES = 20
@@ -235,13 +235,14 @@ def _test_off(connect: Connector, index: int) -> str:
 def _test_laser(connect: Connector, board: Board, index: int) -> str:
     """Emission, gate and photodiode against the set point, then off, with the gate open, against darkness."""
     file, wiring = connect.file, connect.file.lasers[index]
+    lamp = 1 << free_line(file)
     with _shut_after(board), _using(connect.omicron(index)) as head:  # left in reverse: the laser first
+        board.set_lines(lamp)
         head.arm(wiring.power_mw)
         head.emit()
         connect.clock.sleep(file.warm_up_s)
-        head.require_power(file.power_tolerance)
-        own = head.measured_mw()
-        board.set_lines(1 << wiring.gate_line)
+        own = head.require_power(file.power_tolerance)
+        board.set_lines(lamp | 1 << wiring.gate_line)
         seen = 1e3 * board.counts(wiring.photodiode_pin) * wiring.watts_per_count
         low, high = (share * wiring.power_mw for share in wiring.photodiode_limits)
         if not low <= seen <= high:

@@ -1,26 +1,23 @@
 """The rig file: which device hangs on which port, what is wired to what, and the limits of every axis.
 
 The scene says what the rig is (geometry, wavelengths, exposures that the pipeline is told); the rig file says which
-hardware makes it so. `port = "emulated"` puts an emulated device in the place of a real one, a camera of the kind
-`simulated` sees what the emulated and real devices light: any mixture works.
+hardware makes it so; `disco_twin.rig_rules` reads it and says what is possible. `port = "emulated"` puts an emulated
+device in the place of a real one, a camera of the kind `simulated` sees what the emulated and real devices light: any
+mixture works.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from hw.bracket import Bracket
-from hw.errors import DiscoError, InputError
 from hw.record import Sensor
-from pipeline.config import Strict, load_toml
-from pipeline.rig import RigConfig
+from pipeline.config import Strict
 
 EMULATED = "emulated"
 PROJECTOR_STEPS = 4096  # of the board's 12-bit converters
-WAVELENGTH_TOLERANCE_NM = 10.0
 
 Positive = Annotated[float, Field(gt=0)]
 Line = Annotated[int, Field(ge=0, le=5)]
@@ -40,15 +37,6 @@ class LaserDevice(Strict):
     photodiode_pin: Line
     watts_per_count: Positive  # of laser power on the object, per count of the photodiode
     photodiode_limits: tuple[Positive, Positive] = (0.5, 1.5)  # shares of the power; outside, the image is refused
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        low, high = self.photodiode_limits
-        if not low < 1 < high:
-            raise ValueError("photodiode_limits must enclose 1, as in [0.5, 1.5]")
-        if 1023 * self.watts_per_count < 1e-3 * self.power_mw:
-            raise ValueError("watts_per_count is too small: the photodiode's converter ends below power_mw")
-        return self
 
 
 class BoardDevice(Strict):
@@ -135,14 +123,6 @@ class SensorDevice(Strict):
             responsivity=self.responsivity,
         )
 
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
-        try:
-            self.bracket()
-        except DiscoError as error:
-            raise ValueError(str(error)) from None
-        return self
-
 
 class MeterDevice(Strict):
     """A calibrated power meter in the beam, for the self-test alone."""
@@ -166,28 +146,11 @@ class DevicesFile(Strict):
     warm_up_s: Annotated[float, Field(ge=0, le=3600)] = 60.0  # from emission to the first image
     power_tolerance: Annotated[float, Field(gt=0, le=0.5)] = 0.1  # laser's own reading against power_mw
 
-    @model_validator(mode="after")
-    def _wired_once(self) -> Self:
-        lines = [laser.gate_line for laser in self.lasers] + [self.board.floodlight_line]
-        if len(set(lines)) < len(lines):
-            raise ValueError(f"gate_line and floodlight_line must be distinct TTL lines, found {lines}")
-        ports = [p for p in self.ports().values() if p != EMULATED]
-        if len(set(ports)) < len(ports):
-            raise ValueError(f"two devices share a port: {', '.join(sorted(p for p in ports if ports.count(p) > 1))}")
-        kinds = {camera.kind for camera in self.cameras}
-        if len(kinds) > 1:
-            raise ValueError("cameras must be all of the kind genicam or all simulated: they share one sensor")
-        if kinds == {"genicam"} and self.sensor is None:
-            raise ValueError("GenICam cameras need the table [sensor]")
-        if self.sensor is not None and len(self.sensor.responsivity) != len(self.lasers):
-            raise ValueError(f"sensor.responsivity needs {len(self.lasers)} values, one a laser")
-        return self
-
     def ports(self) -> dict[str, str]:
-        """Name of the device -> its serial port."""
-        named = {f"laser {i} ({laser.wavelength_nm:g} nm)": laser.port for i, laser in enumerate(self.lasers)}
-        named |= {"board": self.board.port, "turntable": self.turntable.port}
-        return named | ({} if self.power_meter is None else {"power meter": self.power_meter.port})
+        """Key in the file -> serial port."""
+        named = {f"lasers[{i}].port": laser.port for i, laser in enumerate(self.lasers)}
+        named |= {"board.port": self.board.port, "turntable.port": self.turntable.port}
+        return named | ({} if self.power_meter is None else {"power_meter.port": self.power_meter.port})
 
     @property
     def all_emulated(self) -> bool:
@@ -203,29 +166,3 @@ class DevicesFile(Strict):
     def simulated_cameras(self) -> bool:
         """Whether the renderer is needed."""
         return any(camera.kind == "simulated" for camera in self.cameras)
-
-
-def load_rig_file(path: Path) -> DevicesFile:
-    """Read and check a rig file."""
-    return load_toml(path, DevicesFile)
-
-
-def require_scene(rig: DevicesFile, scene: RigConfig, path: Path) -> None:
-    """Refuse a rig file that is not this scene's rig."""
-
-    def wrong(problem: str, key: str, value: object, allowed: object) -> InputError:
-        return InputError(problem, file=path, key=key, value=value, allowed=str(allowed))
-
-    if len(rig.lasers) != len(scene.lasers):
-        raise wrong("the scene has other lasers", "lasers", len(rig.lasers), len(scene.lasers))
-    for i, (laser, nominal) in enumerate(zip(rig.lasers, scene.lasers, strict=True)):
-        if abs(laser.wavelength_nm - nominal.wavelength_nm) > WAVELENGTH_TOLERANCE_NM:
-            allowed = f"{nominal.wavelength_nm:g} within {WAVELENGTH_TOLERANCE_NM:g}"
-            raise wrong("the scene has another laser", f"lasers[{i}].wavelength_nm", laser.wavelength_nm, allowed)
-    names = [camera.name for camera in rig.cameras]
-    expected = [camera.name for camera in scene.cameras]
-    if names != expected:
-        raise wrong("the scene has other cameras", "cameras", names, expected)
-    if scene.projector.steps != PROJECTOR_STEPS:
-        raise wrong("the board's mirrors have other steps than rig.projector.steps of the scene", "board",
-                    PROJECTOR_STEPS, scene.projector.steps)  # fmt: skip

@@ -23,6 +23,15 @@ class Aim:
     v: int
 
 
+@dataclass(frozen=True)
+class LaserReading:
+    """One laser with every gate shut, in watts: what it is set to, its own reading, its photodiode's in the dark."""
+
+    set_w: float
+    own_w: float
+    dark_w: float
+
+
 class Laser(Protocol):
     @property
     def wavelength_nm(self) -> float: ...
@@ -96,6 +105,12 @@ class Rig(Protocol):
 
     def announce(self, aims: Sequence[Aim]) -> None:
         """The spots that will be asked for: lets a simulated rig work ahead. Real rigs ignore it."""
+
+    def check(self) -> Sequence[LaserReading]:
+        """Asked for before every view, in the dark: refuses a rig whose lasers are not what they were set to.
+
+        What was read, one a laser; nothing from a rig whose lasers have no reading of their own.
+        """
 
     def make_safe(self) -> None:
         """Gates shut, lasers off, floodlight off. Never raises."""

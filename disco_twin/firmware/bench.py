@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from hw.interface import Camera
 from hw.record import RawImage
 
 FLOOD_LINE = LINES - 1  # the lasers' gates are lines 0, 1, 2
+LAMP_LINE = LINES - 2  # the warning lamp: high as long as the rig is armed
 AT_ANGLE_DEG = 0.01  # the object stands at a configured angle if it is as close as this
 
 
@@ -42,7 +44,10 @@ class EmittedPower:
 class Bench:
     """A twin whose lasers, mirrors, gates, photodiode and turntable are emulated devices.
 
-    `hazards` lists what must never happen: light that moves, or two lasers at once.
+    `hazards` lists what must never happen, whether light falls through or not. It is looked for whenever a line
+    changes, anything is moved, a laser starts or its port is given back: two gates at once; a gate open while mirrors
+    or turntable move; a laser that starts, or shines, without the warning lamp, or starts behind an open gate; a laser
+    that emits though nobody holds its port.
     """
 
     def __init__(self, twin: TwinRig, clock: Clock) -> None:
@@ -56,7 +61,11 @@ class Bench:
             )
         self.twin, self.clock = twin, clock
         self.heads = [LaserHead(laser.wavelength_nm, laser.power_mw) for laser in config.lasers]
-        self.board = MirrorHead(sample=self._counts, on_move=lambda: self._require_dark("the mirrors"))
+        for index, head in enumerate(self.heads):
+            head.on_start = partial(self._started, index)
+        self.board = MirrorHead(
+            sample=self._counts, on_move=partial(self._require_shut, "the mirrors"), on_lines=self._lines_changed
+        )
         self.spindle = Spindle(on_move=self.turned)
         self.cameras: list[Camera] = [BenchCamera(self, camera) for camera in twin.cameras]
         self.hazards: list[str] = []
@@ -87,13 +96,42 @@ class Bench:
         """The lasers whose light falls on the object now."""
         return [i for i in range(len(self.heads)) if self.board.lines >> i & 1 and self._share(i) > 0.0]
 
-    def _require_dark(self, what: str) -> None:
-        if self.light():
-            self.hazards.append(f"{what} moved in the light of laser {self.light()}")
+    # ---- what must never happen
+
+    def _gates(self) -> list[int]:
+        return [i for i in range(len(self.heads)) if self.board.lines >> i & 1]
+
+    def _lamp(self) -> bool:
+        return bool(self.board.lines >> LAMP_LINE & 1)
+
+    def _require_shut(self, what: str) -> None:
+        if self._gates():
+            self.hazards.append(f"{what} moved with open gates {self._gates()}")
+
+    def _lines_changed(self) -> None:
+        gates, now = self._gates(), self.clock.now()
+        if len(gates) > 1:
+            self.hazards.append(f"gates {gates} are open at once")
+        for what, moves in (("a mirror", not self.board.settled(now)), ("the turntable", self.spindle.busy(now))):
+            if gates and moves:
+                self.hazards.append(f"gates {gates} are open while {what} still moves")
+        if self.light() and not self._lamp():
+            self.hazards.append(f"laser {self.light()} shines without the warning lamp")
+
+    def _started(self, laser: int) -> None:
+        if not self._lamp():
+            self.hazards.append(f"laser {laser} is started without the warning lamp")
+        if laser in self._gates():
+            self.hazards.append(f"laser {laser} is started behind an open gate")
+
+    def left(self, laser: int) -> None:
+        """Nobody holds a laser's port any more."""
+        if self._share(laser) > 0.0:
+            self.hazards.append(f"laser {laser} emits and nobody holds its port")
 
     def turned(self, angle_deg: float) -> None:
         """The turntable has been sent to an angle; the twin's clock is charged for a turn to another one."""
-        self._require_dark("the turntable")
+        self._require_shut("the turntable")
         angles = np.asarray(self.twin.config.turntable_angles_deg)
         away = np.abs(np.remainder(angle_deg - angles + 180.0, 360.0) - 180.0)
         nearest = int(np.argmin(away))
@@ -109,7 +147,6 @@ class Bench:
         """Put the twin into the state that the devices are in."""
         now, light = self.clock.now(), self.light()
         if len(light) > 1:
-            self.hazards.append(f"lasers {light} at once")
             raise DiscoError(f"the simulated camera sees lasers {light} at once")
         if light and not self.board.settled(now):
             raise DiscoError("the simulated camera sees the mirrors moving")

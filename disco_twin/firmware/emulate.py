@@ -5,9 +5,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
-from disco_twin.firmware.bench import FLOOD_LINE, Bench
+from disco_twin.firmware.bench import FLOOD_LINE, LAMP_LINE, Bench
 from disco_twin.firmware.mm_ard import MmArdFirmware
 from disco_twin.firmware.omicron import OmicronFirmware
 from disco_twin.firmware.wire import Line
@@ -19,8 +20,9 @@ from hw.devices.mm_ard import MirrorBoard
 from hw.devices.omicron import OmicronLaser
 from hw.devices.zaber import ZaberTable
 from hw.ports.protocol_memory import attach
-from hw.rig import Devices, LaserWiring, SerialRig
+from hw.rig import SerialRig
 from hw.serial_link import Link
+from hw.wiring import Devices, LaserWiring
 
 _NUMBERS = itertools.count()
 
@@ -32,6 +34,8 @@ class Emulation:
         self.clock: Clock = VirtualClock() if clock is None else clock
         self.bench = Bench(twin, self.clock)
         self.lines = {f"laser{i}": Line(OmicronFirmware(head), self.clock) for i, head in enumerate(self.bench.heads)}
+        for i in range(len(self.bench.heads)):
+            self.lines[f"laser{i}"].on_closed = partial(self.bench.left, i)
         self.lines["board"] = Line(MmArdFirmware(self.bench.board), self.clock)
         self.lines["turntable"] = Line(ZaberFirmware(self.bench.spindle), self.clock)
 
@@ -76,8 +80,9 @@ class Emulation:
             self.wiring(),
             self.bench.cameras,
             self.clock,
+            armed=True,
             flood_line=FLOOD_LINE,
-            armed_line=FLOOD_LINE - 1,
+            armed_line=LAMP_LINE,
             timebase=self.bench,
             announce=self.bench.twin.announce,
             centre=(steps // 2, steps // 2),

@@ -35,10 +35,14 @@ class Galvo:
 
 @dataclass
 class MirrorHead:
-    """What the board drives. `sample(pin)` is what the converter sees, 0 .. 1023; `on_move` hears of mirror moves."""
+    """What the board drives. `sample(pin)` is what the converter sees, 0 .. 1023.
+
+    `on_move` hears of every mirror move before it, `on_lines` of every change of the TTL lines after it.
+    """
 
     sample: Callable[[int], int] = lambda pin: 0
     on_move: Callable[[], None] = lambda: None
+    on_lines: Callable[[], None] = lambda: None
     channels: int = 2
     galvos: tuple[Galvo, Galvo] = field(default_factory=lambda: (Galvo(), Galvo()))
     lines: int = 0
@@ -60,13 +64,18 @@ class MirrorHead:
         """The TTL pattern."""
         self.pattern = pattern & (1 << LINES) - 1
         if not self.blanking:
-            self.lines = self.pattern
+            self._drive(self.pattern)
         self.follow_trigger()
 
     def follow_trigger(self) -> None:
         """Blanking mode: the trigger input, which nothing is plugged into, is low. Leaving it changes no line."""
         if self.blanking:
-            self.lines = self.pattern if self.blank_on_high else 0
+            self._drive(self.pattern if self.blank_on_high else 0)
+
+    def _drive(self, lines: int) -> None:
+        changed, self.lines = lines != self.lines, lines
+        if changed:
+            self.on_lines()
 
 
 class MmArdFirmware:

@@ -19,7 +19,10 @@ KEPT_BY_PRESETS = Mode.ADHOC | Mode.AUTOSTART | Mode.AUTO_POWERUP
 
 @dataclass
 class LaserHead:
-    """State of one laser. `stored_*` survive a power cut; times are on the injected clock."""
+    """State of one laser. `stored_*` survive a power cut; times are on the injected clock.
+
+    `on_start` hears of every LOn that is obeyed by a laser that was off.
+    """
 
     wavelength_nm: float
     max_power_mw: float
@@ -33,6 +36,7 @@ class LaserHead:
     interlock_closed: bool = True
     enabled: bool = True
     memory_writes: int = 0
+    on_start: Callable[[], None] = lambda: None
 
     def __post_init__(self) -> None:
         self.start(0.0)
@@ -82,6 +86,7 @@ class LaserHead:
             return False
         if self.on_since is None:
             self.on_since = now
+            self.on_start()
         return True
 
     def lit(self, now: float) -> bool:

@@ -85,6 +85,7 @@ class Line:
         self.answer_faults: deque[Fault | None] = deque()
         self.command_faults: deque[Callable[[bytes], bytes] | None] = deque()
         self.plugged = True
+        self.on_closed: Callable[[], None] = lambda: None  # nobody holds the port any more
         self._users = 0  # an old handle may be closed after a new one was opened
         self._coming: list[Timed] = []  # by the time at which the device begins to send them
         self._free = self._held_until = self._taken = -math.inf
@@ -127,7 +128,9 @@ class Line:
 
     def closed(self) -> None:
         """The port was closed; the device goes on."""
-        self._users = max(0, self._users - 1)
+        held, self._users = self._users, max(0, self._users - 1)
+        if held == 1:
+            self.on_closed()
 
     def _require_cable(self) -> None:
         if not self._users:

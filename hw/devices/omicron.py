@@ -261,12 +261,17 @@ class OmicronLaser:
         """Refuse to go on without the guard that would switch the laser off."""
         self.link.require_guard()
 
-    def require_power(self, tolerance: float) -> None:
-        """Refuse a laser whose own reading is not its set point within this share."""
-        measured = self.measured_mw()
-        if not abs(measured - self.armed_mw) <= tolerance * self.armed_mw:
-            problem = f"emits {measured:.2f} mW instead of {self.armed_mw:g} mW (allowed: {100 * tolerance:g} % off)"
-            raise DeviceFault(self.link.url, self.name, problem, "let it warm up longer, or have the laser serviced")
+    def require_power(self, tolerance: float) -> float:
+        """Its own reading in mW; refused where two in a row are not its set point within this share.
+
+        Answers have no checksum: one garbled digit must not stop a scan.
+        """
+        for _ in range(2):
+            measured = self.measured_mw()
+            if abs(measured - self.armed_mw) <= tolerance * self.armed_mw:
+                return measured
+        problem = f"emits {measured:.2f} mW instead of {self.armed_mw:g} mW (allowed: {100 * tolerance:g} % off)"
+        raise DeviceFault(self.link.url, self.name, problem, "let it warm up longer, or have the laser serviced")
 
     def stop_emission(self) -> None:
         """Switch the light off; it takes seconds to come back. May be asked for at any time."""

@@ -18,6 +18,7 @@ from types import FrameType
 from hw.errors import DiscoError, InputError
 from hw.interface import Floodlight, Rig, gate_open
 from hw.record import RawImage, Sensor
+from pipeline.capture.lasers import DRIFT_SHARE, append_lasers, drifts, read_lasers
 from pipeline.capture.layout import ImageMeta
 from pipeline.capture.plan import ImageAddress, Plan
 from pipeline.capture.reference import require_unmoved
@@ -88,9 +89,12 @@ def _require_match(rig: Rig, plan: Plan) -> None:
 
 def _sweep(rig: Rig, stream: StreamWriter, signals: _Signals, progress: Progress | None) -> None:
     plan = stream.plan
-    announced = None
+    announced = checked = None
     for index in range(len(stream), len(plan)):
         address = plan.address(index)
+        if checked != address.view:
+            _check_lasers(rig, stream, address.view, signals)
+            checked = address.view
         if address.kind == "silhouette":
             rig.turntable.move(plan.angles_rad[plan.angle_of(address.view)])
         if address.kind == "spot" and announced != address.view:
@@ -101,6 +105,16 @@ def _sweep(rig: Rig, stream: StreamWriter, signals: _Signals, progress: Progress
             stream.append(address, *image)
         if progress is not None:
             progress(index + 1, len(plan))
+
+
+def _check_lasers(rig: Rig, stream: StreamWriter, view: int, signals: _Signals) -> None:
+    """Before a view, in the dark; what is beyond the rig's tolerance is refused by the rig, what drifts is marked."""
+    readings = rig.check()
+    with signals.held():
+        append_lasers(stream.folder, view, rig.now(), readings)
+    drift = drifts(read_lasers(stream.folder)).get(view, 0.0) if readings else 0.0
+    if drift > DRIFT_SHARE:
+        log.warning("view %d: a laser's own reading is %.1f %% off its first one", view, 100 * drift)
 
 
 def _restore(rig: Rig, stream: StreamWriter, sensor: Sensor | None) -> None:

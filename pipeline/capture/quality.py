@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hw.record import Sensor, to_radiance
+from pipeline.capture.lasers import DRIFT_SHARE, drifts, read_lasers
 from pipeline.capture.stream import CorruptImage, StreamReader
 
 SIGNIFICANT = 5.0  # standard deviations: a pixel that shows light
@@ -19,7 +20,8 @@ class ViewQuality:
     """One view. Shares of all its spot images' pixels; range_db: brightest against dimmest significant radiance.
 
     dark: spots (of `spots`) that show hardly any light in any laser; power_w, power_spread: mean of the photodiode and
-    its standard deviation as a share, one value a laser.
+    its standard deviation as a share, one value a laser; own_drift: by how much a laser's own reading was off its first
+    one before this view, as a share.
     """
 
     view: int
@@ -35,6 +37,7 @@ class ViewQuality:
     dark: int
     power_w: tuple[float, ...]
     power_spread: tuple[float, ...]
+    own_drift: float = 0.0
 
     @property
     def remarks(self) -> list[str]:
@@ -48,6 +51,7 @@ class ViewQuality:
                 (self.saturated > 1e-3, "saturated: a shorter exposure or less light"),
                 (self.dark > 0.5 * self.spots, "most spots are dark here: is the object in sight and in focus?"),
                 (drift > 0.1, f"laser power varies by {100 * drift:.0f} %"),
+                (self.own_drift > DRIFT_SHARE, f"a laser's own reading has drifted by {100 * self.own_drift:.1f} %"),
             )
             if condition
         ]
@@ -56,10 +60,11 @@ class ViewQuality:
 def examine(stream: StreamReader, sensor: Sensor) -> Iterator[ViewQuality]:
     """View by view, in the order of the capture."""
     plan, index = stream.plan, 0
+    drift = drifts(read_lasers(stream.folder))
     for view in range(plan.views):
         spots = plan.spots_at(plan.angle_of(view))
         planned = 1 + plan.lasers * len(spots)
-        yield _view(stream, sensor, view, index, planned)
+        yield replace(_view(stream, sensor, view, index, planned), own_drift=drift.get(view, 0.0))
         index += planned
 
 

@@ -196,7 +196,7 @@ class StreamReader:
     """Random access to a stream, finished or not. Safe to use from several threads."""
 
     def __init__(self, folder: Path) -> None:
-        self.plan = load_plan(folder / PLAN)
+        self.plan, self.folder = load_plan(folder / PLAN), folder
         try:
             self._files = StreamFiles(folder, os.O_RDONLY)
         except OSError as error:

@@ -125,16 +125,31 @@ def emits(rig: Path) -> bool:
         link.close()
 
 
-def test_capture_killed_resumed_and_looked_at(rig: Path, camera: Any, tmp_path: Path) -> None:
-    """Rationale: what a laboratory does, without a renderer. Expected: no image lost, the laser never left on."""
+def begun(rig: Path, tmp_path: Path) -> subprocess.Popen[str]:
+    """A capture that has stored some of its 32 images."""
     scene, out = tmp_path / "scene.toml", tmp_path / "out"
-    status, said = finish(disco_twin("rig", "selftest", rig, "--scene", scene))
-    assert status == 0 and "0 frames taken again" in said, said
     process = disco_twin("capture", scene, "--out", out, "--rig", rig, "--arm", "--logs", tmp_path / "logs")
     images, deadline = out / "capture" / "images.bin", time.monotonic() + 100
     while not (images.exists() and images.stat().st_size > 5000):
         assert time.monotonic() < deadline and process.poll() is None, finish(process)
         time.sleep(0.01)
+    return process
+
+
+def change(path: Path, old: str, new: str) -> None:
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+
+
+TOO_NOISY_TO_TELL = ("read_noise_e = 300.0", "read_noise_e = 1e9")  # the fake camera's test pattern wanders
+
+
+def test_capture_killed_resumed_and_looked_at(rig: Path, camera: Any, tmp_path: Path) -> None:
+    """Rationale: what a laboratory does, without a renderer. Expected: no image lost, the laser never left on."""
+    scene, out = tmp_path / "scene.toml", tmp_path / "out"
+    status, said = finish(disco_twin("rig", "selftest", rig, "--scene", scene))
+    assert status == 0 and "0 frames taken again" in said, said
+    process = begun(rig, tmp_path)
     os.kill(process.pid, signal.SIGKILL)
     time.sleep(0.3)
     assert not emits(rig)
@@ -145,7 +160,10 @@ def test_capture_killed_resumed_and_looked_at(rig: Path, camera: Any, tmp_path: 
     assert 0 < len(before) < 32
     status, said = finish(disco_twin("capture", scene, "--out", out, "--rig", rig, "--arm"))
     assert status == 2 and "the rig has changed since image" in said, said  # its test pattern wanders
-    rig.write_text(rig.read_text().replace("read_noise_e = 300.0", "read_noise_e = 1e9"))  # too noisy to tell
+    change(rig, *TOO_NOISY_TO_TELL)
+    status, said = finish(disco_twin("capture", scene, "--out", out, "--rig", rig, "--arm"))
+    assert status == 2 and "read_noise_e = 1000000000.0: the capture in this folder was begun with 300.0" in said, said
+    change(out / "capture" / "devices.toml", *TOO_NOISY_TO_TELL)
     status, said = finish(disco_twin("capture", scene, "--out", out, "--rig", rig, "--arm"))
     assert status == 0, said
     assert not emits(rig)
@@ -158,3 +176,30 @@ def test_capture_killed_resumed_and_looked_at(rig: Path, camera: Any, tmp_path: 
     status, said = finish(disco_twin("quality", out / "capture"))
     assert status == 0 and said.count("front") == 2, said
     assert (tmp_path / "logs" / "laser0.log").read_text().startswith("disco-twin byte log")
+    rows = (out / "capture" / "lasers.csv").read_text().splitlines()
+    assert {row.split(",")[0] for row in rows[1:]} == {"0", "1"} and all(",0.01,0.01,0.0" in row for row in rows[1:])
+
+
+def test_a_guard_that_is_killed_in_the_middle_of_a_scan(rig: Path, camera: Any, tmp_path: Path) -> None:
+    """Rationale: nobody would switch the laser off then. Expected: dark, one line that says so; resumed."""
+    scene, out = tmp_path / "scene.toml", tmp_path / "out"
+    change(rig, *TOO_NOISY_TO_TELL)
+    process = begun(rig, tmp_path)
+    listed = ["ps", "-o", "pid=,args=", "--ppid", str(process.pid)]
+    children = subprocess.run(listed, capture_output=True, text=True, check=True).stdout.splitlines()
+    (guard,) = [int(line.split()[0]) for line in children if "hw.guard" in line]
+    os.kill(guard, signal.SIGKILL)
+    status, said = finish(process)
+    assert not emits(rig)
+    reason = "its guard process was killed (status -9); another one switches the laser off"
+    assert status == 2 and reason in said and "Remedy: see that the laser is off" in said, said
+    assert "Traceback" not in said
+    with StreamReader(out / "capture") as stream:
+        before = [stream.read(i).charge for i in range(len(stream))]
+    assert 0 < len(before) < 32
+    status, said = finish(disco_twin("capture", scene, "--out", out, "--rig", rig, "--arm"))
+    assert status == 0, said
+    with StreamReader(out / "capture") as stream:
+        stream.require_complete()
+        assert all((stream.read(i).charge == charge).all() for i, charge in enumerate(before))
+    assert not emits(rig)

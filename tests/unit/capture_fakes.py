@@ -19,8 +19,9 @@ from typing import Self
 
 import numpy as np
 
-from hw.interface import Aim
+from hw.interface import Aim, LaserReading
 from hw.record import RawImage
+from pipeline.capture.lasers import LASERS
 from pipeline.capture.plan import Plan
 
 SHAPE = (10, 16)
@@ -58,6 +59,8 @@ class FakeRig:
     made_safe: int = 0
     exposures: int = 0
     announced: list[tuple[Aim, ...]] = field(default_factory=list)
+    checks: list[int] = field(default_factory=list)  # exposures by then
+    readings: Callable[[], Sequence[LaserReading]] = tuple
 
     def __post_init__(self) -> None:
         self.lasers = [FakeLaser(self, i) for i in range(self.plan.lasers)]
@@ -82,6 +85,11 @@ class FakeRig:
 
     def announce(self, aims: Sequence[Aim]) -> None:
         self.announced.append(tuple(aims))
+
+    def check(self) -> Sequence[LaserReading]:
+        assert self.powered and self.dark
+        self.checks.append(self.exposures)
+        return self.readings()
 
     def make_safe(self) -> None:
         self.open, self.flood, self.powered = -1, False, False
@@ -187,5 +195,5 @@ def fork(target: Callable[..., None], *args: object) -> BaseProcess:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Every file of a capture folder."""
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+    """Every file of a capture folder but the lasers' own readings, which are no part of the images."""
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.name != LASERS}

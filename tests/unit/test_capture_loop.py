@@ -190,6 +190,8 @@ def test_signals_that_are_ignored_stay_ignored(tmp_path: Path) -> None:
         capture(FakeRig(PLAN, on_expose=after(3, lambda _: os.kill(os.getpid(), signal.SIGHUP))), PLAN, tmp_path)
     finally:
         signal.signal(signal.SIGHUP, before)
+    with StreamReader(tmp_path) as stream:
+        assert stream.complete
 
 
 def test_a_signal_while_the_rig_is_made_safe_does_not_stop_that(tmp_path: Path) -> None:

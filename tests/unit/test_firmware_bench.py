@@ -10,9 +10,12 @@ import pytest
 from capture_fakes import contents
 from test_capture_twin import PLAN, RIG, Glow
 
+from disco_twin.firmware.bench import LAMP_LINE
 from disco_twin.firmware.emulate import Emulation
 from disco_twin.rig import TwinRig
+from hw.devices.omicron_protocol import Mode
 from hw.errors import DeviceFault, DiscoError, InputError, Refused, Unplugged
+from hw.serial_link import Link
 from pipeline.capture.loop import capture
 from pipeline.capture.stream import StreamReader
 from pipeline.rig import FaultsConfig, ProjectorConfig
@@ -72,20 +75,56 @@ def test_a_camera_in_front_of_moving_things_refuses(emulated: Emulation) -> None
 
 
 def test_hazards_are_written_down(emulated: Emulation) -> None:
-    """Behind the rig's back, since the rig refuses them."""
-    bench = emulated.bench
+    """Behind the rig's back, since the rig refuses them: at the change itself, whether a camera looks or not."""
+    bench, lamp = emulated.bench, 1 << LAMP_LINE
+
+    def news() -> list[str]:
+        found, bench.hazards = bench.hazards, []
+        return found
+
     with emulated.serial_rig() as rig:
-        bench.board.set_pattern(0b011)
+        bench.board.set_pattern(lamp | 0b011)
+        assert news() == ["gates [0, 1] are open at once"]
         with pytest.raises(DiscoError, match=r"lasers \[0, 1\] at once"):
             rig.cameras[0].expose()
-        bench.board.set_pattern(0b001)
+        bench.board.set_pattern(lamp | 0b001)
         bench.board.write(0, 5, emulated.clock.now())
         bench.spindle.go(180.0, emulated.clock.now())
-        assert bench.hazards == [
-            "lasers [0, 1] at once",
-            "the mirrors moved in the light of laser [0]",
-            "the turntable moved in the light of laser [0]",
-        ]
+        assert news() == ["the mirrors moved with open gates [0]", "the turntable moved with open gates [0]"]
+        bench.board.set_pattern(lamp)
+        assert news() == []
+        bench.board.set_pattern(lamp | 0b010)
+        assert news() == ["gates [1] are open while a mirror still moves",
+                          "gates [1] are open while the turntable still moves"]  # fmt: skip
+        emulated.clock.sleep(30.0)
+        bench.board.set_pattern(0b010)
+        assert news() == ["laser [1] shines without the warning lamp"]
+        bench.heads[0].on_since = bench.heads[1].on_since = None
+        bench.board.set_pattern(0b001)
+        bench.board.write(1, 7, emulated.clock.now())
+        assert news() == ["the mirrors moved with open gates [0]"]  # though nothing shines
+        assert bench.heads[0].switch_on(emulated.clock.now())
+        assert news() == ["laser 0 is started without the warning lamp", "laser 0 is started behind an open gate"]
+    news()
+
+
+def test_a_laser_that_emits_when_its_port_is_given_back_is_a_hazard(emulated: Emulation) -> None:
+    head = emulated.bench.heads[2]
+    link = Link(emulated.attach()["laser2"], 500_000, "laser", emulated.clock)
+    head.level, head.mode, head.on_since = 1.0, int(Mode.BIAS | Mode.RELEASE), -10.0
+    link.close()
+    assert emulated.bench.hazards == ["laser 2 emits and nobody holds its port"]
+
+
+def test_a_rig_in_all_its_phases_is_no_hazard(emulated: Emulation, tmp_path: Path) -> None:
+    """Rationale: the hazards above are looked for in every capture. Expected: the lamp before lasers, none found."""
+    order = []
+    for index, head in enumerate(emulated.bench.heads):
+        before = head.on_start
+        head.on_start = lambda i=index, b=before: (order.append((i, emulated.bench.board.lines)), b())[1]  # type: ignore[misc]
+    capture(emulated.serial_rig(), PLAN, tmp_path)
+    assert order == [(i, 1 << LAMP_LINE) for i in range(3)]
+    assert emulated.bench.hazards == []
 
 
 def test_more_mirror_steps_than_the_dac_has_are_refused() -> None:

@@ -122,7 +122,7 @@ def test_a_clock_of_its_own_for_real_rigs() -> None:
     clock = VirtualClock(1000.0)
     emulated = Emulation(TwinRig(RIG, Glow(), seed=5), clock)
     model = emulated.serial_rig()
-    rig = SerialRig(model._connect, emulated.wiring(), emulated.bench.cameras, clock)
+    rig = SerialRig(model._connect, emulated.wiring(), emulated.bench.cameras, clock, armed=True)
     with rig:
         assert rig.now() == 0.0
         clock.sleep(2.5)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import trimesh
 
-from disco_twin.rig_file import load_rig_file, require_scene
+from disco_twin.rig_rules import load_rig_file, require_scene
 from pipeline.capture.imported import COLUMNS, CaptureDescription
 from pipeline.config import load_toml
 from pipeline.rig import CameraConfig, RigConfig

@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 from capture_fakes import contents
 from test_capture_twin import PLAN, RIG, Glow
 
+from disco_twin.assembly import assembled
+from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.cli import main
 from disco_twin.firmware.emulate import Emulation
 from disco_twin.rig import TwinRig
 from disco_twin.rig_commands import rig_file_of, selftest, served
-from disco_twin.rig_file import load_rig_file
+from disco_twin.rig_rules import load_rig_file
 from hw.bytelog import ByteLog
-from hw.errors import DeviceFault, DiscoError, SwitchedOff
-from hw.interface import gate_open
-from hw.rig import Refused
+from hw.errors import DeviceFault, DiscoError, Refused, SwitchedOff, Unplugged
+from hw.interface import LaserReading, gate_open
+from hw.rig import SerialRig
+from pipeline.capture.lasers import LASERS, append_lasers, drifts, read_lasers
 from pipeline.capture.loop import capture
+from pipeline.capture.quality import examine
+from pipeline.capture.stream import StreamReader
 from pipeline.rig import RigConfig
+
+SENSOR = lars3_sensor(RIG)
 
 
 def emulation() -> Emulation:
@@ -132,6 +139,119 @@ def test_one_gate_at_a_time_and_none_during_moves() -> None:
             raise RuntimeError
         assert emulated.bench.light() == []
     assert emulated.bench.hazards == []
+
+
+@pytest.mark.parametrize("make", ["serial", "assembled"])
+def test_no_script_lights_a_laser_that_was_not_armed(make: str, tmp_path: Path) -> None:
+    """Rationale: --arm is asked for by the command; a script that builds the rig itself must say it, too.
+
+    Expected: the rig is refused before a byte is said to any device; nothing but real lasers needs permission.
+    """
+    emulated = emulation()
+    said: list[bytes] = []
+    for line in emulated.lines.values():
+        line.receive = said.append  # type: ignore[method-assign]
+    model = emulated.serial_rig()
+    if make == "serial":
+        rig = SerialRig(model._connect, emulated.wiring(), emulated.bench.cameras, emulated.clock, armed=False)
+        with pytest.raises(Refused, match=r"not armed.*Remedy.*--arm"):
+            capture(rig, PLAN, tmp_path)
+        assert said == [] and not rig.connected
+        return
+    (tmp_path / "rig.toml").write_text(text(laser1="/dev/ttyNOBODY"))
+    file = load_rig_file(tmp_path / "rig.toml")
+    with assembled(file, RIG, TwinRig(RIG, Glow(), seed=5), armed=False) as rig, pytest.raises(Refused, match="--arm"):
+        rig.__enter__()
+    with (
+        assembled(file, RIG, TwinRig(RIG, Glow(), seed=5), armed=True) as rig,
+        pytest.raises(Unplugged, match="NOBODY"),
+    ):
+        rig.__enter__()
+
+
+# ---- the lasers' own readings, before every view
+
+
+def test_lasers_are_read_before_every_view_and_written_down(tmp_path: Path) -> None:
+    emulated = emulation()
+    capture(emulated.serial_rig(), PLAN, tmp_path)
+    rows = read_lasers(tmp_path)
+    assert [(row.view, row.laser) for row in rows] == [(view, k) for view in range(PLAN.views) for k in range(3)]
+    assert all(row.set_w == 0.01 and row.own_w == pytest.approx(0.01) and row.dark_w == 0.0 for row in rows)
+    assert drifts(rows) == dict.fromkeys(range(PLAN.views), 0.0)
+
+
+def weaken(emulated: Emulation, laser: int, share: float) -> None:
+    """The head gives less than it is set to; what comes through its gate does not change (its reading is asked for)."""
+    firmware = emulated.lines[f"laser{laser}"].firmware
+    feed = firmware.feed
+
+    def weaker(data: bytes, now: float) -> list[tuple[float, bytes]]:
+        return [
+            (t, re.sub(rb"(?<=!MDP)[0-9.]+", lambda m: b"%.4f" % (share * float(m[0])), a)) for t, a in feed(data, now)
+        ]
+
+    firmware.feed = weaker  # type: ignore[method-assign]
+
+
+def test_a_laser_that_fails_during_the_scan_stops_it_at_the_next_view(tmp_path: Path) -> None:
+    emulated = emulation()
+    at_image(emulated, 2, lambda: weaken(emulated, 1, 0.8))
+    with pytest.raises(DeviceFault, match=r"laser 532 nm emits 8.00 mW instead of 10 mW \(allowed: 10 % off\)"):
+        capture(emulated.serial_rig(), PLAN, tmp_path)
+    views = {row.view for row in read_lasers(tmp_path)}
+    with StreamReader(tmp_path) as stored:
+        assert views == {0} and PLAN.address(len(stored)).view == 1  # no image of the next view was taken
+    assert not any(head.on_since for head in emulated.bench.heads)
+
+
+def test_a_laser_that_drifts_is_marked(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    emulated = emulation()
+    at_image(emulated, 2, lambda: weaken(emulated, 1, 0.95))
+    capture(emulated.serial_rig(), PLAN, tmp_path)
+    assert drifts(read_lasers(tmp_path)) == {0: 0.0} | dict.fromkeys(range(1, PLAN.views), pytest.approx(0.05))
+    assert "view 1: a laser's own reading is 5.0 % off its first one" in caplog.text and "view 0:" not in caplog.text
+    with StreamReader(tmp_path) as stored:
+        marked = [any("own reading has drifted by 5.0 %" in r for r in v.remarks) for v in examine(stored, SENSOR)]
+    assert marked == [False] + [True] * (PLAN.views - 1)
+
+
+def test_one_garbled_power_reading_stops_nothing(tmp_path: Path) -> None:
+    emulated = emulation()
+    with emulated.serial_rig() as rig:
+        emulated.lines["laser0"].answer_faults.append(lambda data: [(0.0, data.replace(b"10.", b"70."))])
+        assert [reading.own_w for reading in rig.check()] == pytest.approx([0.01] * 3)
+
+
+def test_a_gate_that_is_told_shut_and_leaks_is_refused() -> None:
+    emulated = emulation()
+    with emulated.serial_rig() as rig:
+        emulated.bench.board.sample = lambda pin: 9 if pin == 2 else 8
+        with pytest.raises(
+            DeviceFault, match=r"photodiode of laser 476 nm reads 9 counts with every gate shut.*Remedy"
+        ):
+            rig.check()
+        emulated.bench.board.sample = lambda pin: 8
+        assert [reading.dark_w for reading in rig.check()] == [8 * w.watts_per_count for w in emulated.wiring()]
+        with (
+            gate_open(rig.lasers[0]),
+            pytest.raises(Refused, match="checked in the dark, and the gate of laser 0 is open"),
+        ):
+            rig.check()
+
+
+def test_the_table_of_readings_survives_a_crash_in_its_last_line(tmp_path: Path) -> None:
+    readings = [LaserReading(0.01, 0.0101, 0.0), LaserReading(0.01, 0.0, 1e-5)]
+    append_lasers(tmp_path, 0, 1.5, readings)
+    whole = (tmp_path / LASERS).read_bytes()
+    (tmp_path / LASERS).write_bytes(whole[:-5])
+    append_lasers(tmp_path, 0, 2.5, readings)
+    assert [(r.time_s, r.laser, r.own_w) for r in read_lasers(tmp_path)][-2:] == [(2.5, 0, 0.0101), (2.5, 1, 0.0)]
+    assert (tmp_path / LASERS).read_text().count("view,time_s") == 1
+    append_lasers(tmp_path, 1, 3.5, ())
+    assert max(r.view for r in read_lasers(tmp_path)) == 0
+    assert read_lasers(tmp_path / "none") == []
+    assert drifts(read_lasers(tmp_path))[0] == float("inf")  # a laser that began at nothing
 
 
 def test_the_photodiode_is_compared_with_the_set_point() -> None:
@@ -284,9 +404,15 @@ def test_devices_capture_into_a_run_folder_and_nothing_simulates_over_it(
     monkeypatch.setattr("disco_twin.run.light_key", lambda run: "changed code")
     assert command("capture", str(scene), "--out", str(out))[0] == 0
     assert (out / "capture" / "images.bin").read_bytes() == images
+    changed = rig.read_text().replace("zero_deg", "# zero_deg").replace("[turntable]", "[turntable]\nzero_deg = 5.0")
+    rig.write_text(changed)
+    status, said = command("capture", str(scene), "--out", str(out), "--rig", str(rig))
+    assert status == 2 and said.count("\n") == 1
+    assert "rig.toml: turntable.zero_deg = 5.0: the capture in this folder was begun with 0.0. Remedy: " in said
+    assert "zero_deg" not in (out / "capture" / "devices.toml").read_text()  # what it was begun with is kept
+    assert len(read_lasers(out / "capture")) == 3
     status, said = command("quality", str(out / "capture"))
     assert status == 0 and "19/19" in said
-    assert np.isfinite(len(images))
 
 
 # ---- a board that falls silent while a gate is open
@@ -374,3 +500,19 @@ def test_no_failure_of_a_step_keeps_the_rig_from_being_made_safe() -> None:
     rig.devices().board.shut_now = full  # type: ignore[method-assign]
     rig.make_safe()
     assert not any(head.on_since for head in emulated.bench.heads)
+
+
+def test_a_rig_file_is_corrected_before_the_first_image_and_the_pipeline_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first attempt finds no board, and takes no image: what it left may not outlive the correction."""
+    scene, rig, out = tmp_path / "scene.toml", tmp_path / "rig.toml", tmp_path / "out"
+    scene.write_text(SCENE)
+    rig.write_text(rig_file_of(RigConfig(cameras=(RIG.cameras[0],)), {"board": "/dev/ttyNOBODY"}))
+    monkeypatch.setattr("disco_twin.simulate.twin_rig", lambda world, folder: TwinRig(world.scene.rig, Glow(), 5))
+    for port, status in (("/dev/ttyNOBODY", 2), ("emulated", 0)):
+        rig.write_text(rig_file_of(RigConfig(cameras=(RIG.cameras[0],)), {"board": port}))
+        with pytest.raises(SystemExit) as end:
+            main(["capture", str(scene), "--out", str(out), "--rig", str(rig)])
+        assert end.value.code == status, capsys.readouterr().err
+        assert f'port = "{port}"' in (out / "capture" / "devices.toml").read_text()
