@@ -120,7 +120,7 @@ def objects(quick: bool) -> Iterator[tuple[str, Any, Any, list[int]]]:
     from disco_twin.object.build import Boundary, Medium, TwinObject, build_object, build_scan, hat_basis
     from disco_twin.scene import load_scene
 
-    scene = load_scene(SCENE)
+    scene = load_scene(SCENE, faults=False)
     obj = build_object(scene)
     yield "quick", obj, hat_basis(obj.mesh, build_scan(scene, obj.mesh)), [10, 500, 900]
     ball = trimesh.creation.icosphere(subdivisions=4, radius=30.0)

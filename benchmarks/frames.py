@@ -59,7 +59,7 @@ def capture_frames(folder: Path, spots: int, walks: int, angles: int = 3, vertic
     from pipeline.capture.loop import capture
     from pipeline.rig import RigConfig
 
-    scene = load_scene(SCENE)
+    scene = load_scene(SCENE, faults=False)
     lit = {"warm_up": True, "blue_noise": True, "mode_hop": True, "speckle": True, "flare": True}
 
     def rig(factor: int) -> RigConfig:

@@ -27,7 +27,11 @@ ProfileOption = Annotated[
     Literal["full", "small"], typer.Option(help="`small` shrinks the scene: fewer spots, pixels and walks.")
 ]
 FaultsOption = Annotated[
-    bool, typer.Option("--faults", help="All rig faults of 2004 on; the pipeline calibrates from the rig's own images.")
+    bool | None,
+    typer.Option(
+        "--faults/--no-faults",
+        help="All rig faults of 2004 on (the pipeline then calibrates from the rig's images) or off; else the scene's.",
+    ),
 ]
 BudgetOption = Annotated[
     bool, typer.Option("--budget", help="Reconstruct with parts of the calibration made true: what does each cost?")
@@ -44,7 +48,7 @@ def run(
     out: RunOut,
     profile: ProfileOption = "full",
     methods: MethodsOption = None,
-    faults: FaultsOption = False,
+    faults: FaultsOption = None,
 ) -> None:
     """Capture, reconstruct, relight and score; writes summary.json and report.html. The same command resumes."""
     from disco_twin.run import open_run, print_scores, run_all
@@ -62,7 +66,7 @@ def capture(
     scene: SceneFile,
     out: RunOut,
     profile: ProfileOption = "full",
-    faults: FaultsOption = False,
+    faults: FaultsOption = None,
     rig: Annotated[
         Path | None, typer.Option(metavar="RIG.TOML", help="Capture with the devices of a rig file, not with the twin.")
     ] = None,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from disco_twin.world import World, left_out_by_the_twin
+from pipeline.capture.targets import make_targets
 from pipeline.resources import usable_cores
 
 # Measured on an earlier quick.toml (alpha .3, mean free path about 1.7 mm, twice today's), per core and second; other
@@ -34,6 +35,9 @@ def predict(world: World) -> list[tuple[str, str]]:
         ("bytes", f"{raw / 1e6:.0f} MB raw, about {raw / COMPRESSION / 1e6:.1f} MB stored"),
         ("real rig", f"about {images / IMAGES_PER_S / 60:.1f} minutes of acquisition"),
     ]
+    if scene.rig.faults.deviation:
+        targets = sum(len(make_targets(scene.rig, c)[1]) for c in range(len(scene.rig.cameras)))
+        lines.insert(2, ("calibration", f"{targets} images of chessboards and of a white plate"))
     lines += [(name, f"about {value / 60:.1f} minutes on {cores} cores") for name, value in seconds.items()]
     lines += [("left out", f"{item['what']}: {item['because']}") for item in left_out_by_the_twin(world)]
     return lines

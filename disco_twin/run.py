@@ -81,7 +81,7 @@ class Run:
 
 
 def open_run(
-    scene_file: Path, out: Path, profile: Profile, methods: str | None, console: Console, faults: bool = False
+    scene_file: Path, out: Path, profile: Profile, methods: str | None, console: Console, faults: bool | None = None
 ) -> Run:
     """Read the scene and claim the folder for it."""
     scene = load_scene(scene_file, profile, faults)

@@ -101,15 +101,15 @@ def _colours(light: Light) -> list[Colour]:
     return [light.constant, *(lobe.radiance for lobe in light.lobes)] if light.kind == "environment" else [light.colour]
 
 
-def load_scene(path: str | Path, profile: Profile = "full", faults: bool = False) -> Scene:
+def load_scene(path: str | Path, profile: Profile = "full", faults: bool | None = None) -> Scene:
     """Read a scene; file names inside it are relative to its folder. `small` shrinks it, see `shrink`.
 
-    faults: every fault of the rig is on, whatever the scene says
+    faults: every fault of the rig is on or off, whatever the scene says
     """
     scene = load_toml(path, Scene)
-    if faults:
-        on = FaultsConfig(**dict.fromkeys(FaultsConfig.model_fields, True))
-        scene = scene.model_copy(update={"rig": scene.rig.model_copy(update={"faults": on})})
+    if faults is not None:
+        all_of_them = FaultsConfig(**dict.fromkeys(FaultsConfig.model_fields, faults))
+        scene = scene.model_copy(update={"rig": scene.rig.model_copy(update={"faults": all_of_them})})
     return shrink(scene) if profile == "small" else scene
 
 

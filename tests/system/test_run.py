@@ -86,7 +86,7 @@ def test_summary_has_exactly_what_the_design_says(summary: dict[str, Any]) -> No
     assert (summary["scene"], summary["seed"], summary["method"]) == ("quick", 1, "default")
     assert {"name", "seconds", "peak_mb"} == set(summary["stages"][0])
     names = [s["name"] for s in summary["stages"]]
-    assert names[:4] == ["scan", "capture", "truth", "references"]
+    assert names[:5] == ["scan", "targets", "capture", "truth", "references"]
     assert all(s["seconds"] > 0 and 10 < s["peak_mb"] < 8000 for s in summary["stages"])
     capture = summary["capture"]
     assert (capture["views"], capture["spots"], capture["wavelengths"]) == (6, 75, 3)
@@ -130,7 +130,7 @@ def test_a_finished_run_is_not_repeated(run_folder: Path, scene: Path) -> None:
     before = {p: p.stat().st_mtime_ns for p in (run_folder / "capture").iterdir()}
     status, out, err = finish(disco_twin("run", scene, "--out", run_folder, "--profile", "small"))
     assert status == 0, err
-    assert out.count("finished before") == 6
+    assert out.count("finished before") == 7
     assert before == {p: p.stat().st_mtime_ns for p in (run_folder / "capture").iterdir()}
 
 

@@ -34,8 +34,8 @@ QUICK = Path(__file__).parents[2] / "scenes" / "quick.toml"
 
 @cache
 def world() -> World:
-    """The quick scene."""
-    return World(load_scene(QUICK))
+    """The quick scene, before an ideal rig."""
+    return World(load_scene(QUICK, faults=False))
 
 
 def faulty_rig(width: int = 192, angles: tuple[float, ...] = (0.0, 120.0, 240.0)) -> RigConfig:

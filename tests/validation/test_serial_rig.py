@@ -24,7 +24,7 @@ def test_quick_through_serial_lines_equals_the_direct_twin(repository: Path, tmp
     Expected behaviour: 1806 images, and the three files of the stream are the same bytes; no light while anything
     moves, never two lasers at once.
     """
-    world = World(load_scene(repository / "scenes" / "quick.toml"))
+    world = World(load_scene(repository / "scenes" / "quick.toml", faults=False))
     scene, transport = world.scene, world.transport
     from disco_twin.light.response import SpotResponses
 

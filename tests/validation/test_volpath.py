@@ -97,7 +97,7 @@ def test_the_quick_scene_agrees_with_stock_volpath(repository: Path, tmp_path: P
     the whole image (red laser, surface reflection included), within both sides' noise. Mitsuba interpolates albedo, we
     interpolate sigma_s: at the rims of crack and patch that differs by less than this noise.
     """
-    scene = load_scene(repository / "scenes" / "quick.toml")
+    scene = load_scene(repository / "scenes" / "quick.toml", faults=False)
     whole = build_object(scene)
     m = whole.medium
     obj = TwinObject(whole.mesh, whole.boundary, Medium(m.sigma_t[:1], m.albedo[:1], m.low, m.high, m.g[:1]))
