@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.deviation import ActualRig, actual_rig
 from disco_twin.folder import RunFolder, write_atomically
 from disco_twin.pipeline_process import reconstruct_apart
@@ -107,7 +106,7 @@ def score_budget(world: World, folder: RunFolder, method: str) -> list[dict[str,
             file=folder.work / "calibration.json",
             remedy="disco-twin run SCENE --faults --out DIR",
         )
-    nominal = nominal_calibration(scene.rig, lars3_sensor(scene.rig))
+    nominal = nominal_calibration(scene.rig, own.sensor)
     true = true_calibration(scene.rig, actual_rig(scene.rig, scene.seed), nominal)
     rows = [{"calibration": "measured"} | row for row in score_relit_images(world, folder, (method,))]
     wanted = {"nominal": nominal} | {name: make(own, true) for name, make in VARIANTS.items()}

@@ -9,6 +9,7 @@ from disco_twin.figures import picture_figure
 from disco_twin.results import comparisons, impulses
 from disco_twin.run import reopen_run
 from disco_twin.summary import load_summary
+from pipeline.calibrate.calibration import Calibration
 
 LIGHTS = ("directional", "edge", "behind", "projector")
 
@@ -20,7 +21,8 @@ def main(run: Path, target: Path) -> None:
     opened = reopen_run(run, None, Console())
     summary = load_summary(opened.folder.summary_file)
     method = summary["method"]
-    spots = [row[0] for row in impulses(opened.scene.rig, opened.folder.capture)[0]]
+    sensor = Calibration.load(opened.folder.work / "calibration.json").sensor
+    spots = [row[0] for row in impulses(opened.scene.rig, opened.folder.capture, sensor)[0]]
     found = comparisons(opened.world, opened.folder, [method], summary["relit"])
     first = opened.scene.relight.views[0].name
     shown = [c for c in found if c.view == first and c.light in LIGHTS]

@@ -27,7 +27,7 @@ def section(found: Found, wavelengths_nm: Sequence[float]) -> tuple[str, str]:
         return NOT_MEASURED.get(str(found.get("source")), "No figures."), ""
     groups = {
         "Lenses, from chessboards": _lenses(found),
-        "Brightness, from the white plate and the photodiode": _brightness(found["photometric"], wavelengths_nm),
+        "Brightness, from exposures of a board, the white plate and the photodiode": _brightness(found, wavelengths_nm),
         "The object before the cameras, from silhouettes": _poses(found),
         "The projector, from laser spots": _projector(found["projector"]),
     }
@@ -58,15 +58,23 @@ def _lenses(found: Found) -> Iterator[Row]:
 
 
 def _brightness(found: Found, wavelengths_nm: Sequence[float]) -> Iterator[Row]:
-    for camera, factors in found["white_balance"].items():
-        pairs = zip(factors, found["white_balance_error"][camera], strict=True)
+    if found["response"]:
+        response = found["response"]
+        yield (
+            "the camera's response",
+            f"known to {response['error_share']:.2%}",
+            f"half of the digital range stands for {response['exposure_at_half_range']:.1%} of the full well",
+        )
+    light = found["photometric"]
+    for camera, factors in light["white_balance"].items():
+        pairs = zip(factors, light["white_balance_error"][camera], strict=True)
         yield f"white balance, {camera}", ", ".join(_pm(*x, 4) for x in pairs), "a factor per laser"
     for k, nm in enumerate(wavelengths_nm):
         yield (
             f"power of the laser at {nm:.0f} nm",
-            f"{1e3 * found['power_w'][k]:.3g} mW",
-            f"drifted by {found['power_drift'][k]:.0%} of its mean; single exposures of the plate scatter by "
-            f"{found['power_scatter'][k]:.2%} once the photodiode is divided out (speckle)",
+            f"{1e3 * light['power_w'][k]:.3g} mW",
+            f"drifted by {light['power_drift'][k]:.0%} of its mean; single exposures of the plate scatter by "
+            f"{light['power_scatter'][k]:.2%} once the photodiode is divided out (speckle)",
         )
 
 

@@ -16,6 +16,8 @@ from disco_twin.report import ReportData
 from disco_twin.score import load_model, load_relit, load_scores
 from disco_twin.simulate import reference_path
 from disco_twin.world import World, mm_per_pixel
+from hw.record import Sensor
+from pipeline.calibrate.calibration import Calibration
 from pipeline.rig import RigConfig
 
 F64 = NDArray[np.float64]
@@ -32,7 +34,8 @@ def collect(world: World, folder: RunFolder, summary: dict[str, Any]) -> ReportD
     truth = Truth.load(folder.twin / "truth.npz")
     points = np.asarray(world.scan.vertices, np.float64)
     distance = np.linalg.norm(points[truth.columns][:, None] - points[None], axis=2)
-    shown, damaged = impulses(world.scene.rig, folder.capture)
+    sensor = Calibration.load(folder.work / "calibration.json").sensor
+    shown, damaged = impulses(world.scene.rig, folder.capture, sensor)
     models = {}
     for method in methods:
         if (model := load_model(folder, method)) is not None:
@@ -69,17 +72,16 @@ def notes(world: World) -> list[str]:
     ]
 
 
-def impulses(rig: RigConfig, capture: Path) -> tuple[list[list[Impulse]], list[str]]:
+def impulses(rig: RigConfig, capture: Path, sensor: Sensor) -> tuple[list[list[Impulse]], list[str]]:
     """Rows: cameras, columns: spots spread over the turntable angles; at the laser of the longest wavelength.
 
     A spot with a damaged image is left out; the second list says which image that was.
     """
-    from disco_twin.camera.lars3 import lars3_sensor
     from pipeline.calibrate.calibration import nominal_calibration
     from pipeline.capture.plan import ImageAddress
     from pipeline.capture.stream import CorruptImage, StreamReader
 
-    calibration = nominal_calibration(rig, lars3_sensor(rig))
+    calibration = nominal_calibration(rig, sensor)
     laser = int(np.argmax([x.wavelength_nm for x in rig.lasers]))
     columns: list[list[Impulse]] = []
     damaged: list[str] = []

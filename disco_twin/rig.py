@@ -99,6 +99,10 @@ class TwinRig:
     ) -> None:
         self.make_safe()
 
+    def exponent(self) -> int | None:
+        """The exposure that all pixels are told to take; None: each decides for itself."""
+        return None
+
     def now(self) -> float:
         """Seconds on the virtual clock since the rig was switched on."""
         return self.clock
@@ -239,6 +243,13 @@ class TargetRig(TwinRig):
         self.turntable = TwinTargetHolder(self, placements)
 
 
+class BracketRig(TargetRig):
+    """One camera of the twin before a board that stays; "placement" k is an exposure of 2^-k of the longest."""
+
+    def exponent(self) -> int | None:
+        return self.scene.angle
+
+
 @dataclass
 class TwinTargetHolder:
     """Puts target number `angle_rad` in place."""
@@ -283,6 +294,7 @@ class TwinCamera:
             self._radiance(watts, address),
             max(scene.gate, 0),
             generator(rig.seed, Stream.SENSOR, *address, repeats),
+            rig.exponent(),
         )
         gain = 1.0 if scene.gate < 0 else rig.actual.photodiode[scene.gate]
         scale = watts_per_count(rig.config.lasers[max(scene.gate, 0)])

@@ -29,7 +29,7 @@ METHODS: tuple[str, ...] = get_args(Method)
 BASELINES = ("dipole", "lambertian")
 OUTPUTS = {  # files that a finished stage leaves, as patterns in the run folder
     "scan": ("capture/scan.ply", "capture/rig.json", "capture/sensor.json"),
-    "targets": ("capture/calibration/*/*",),
+    "targets": ("capture/calibration/*/*", "capture/calibration/*/bracket/*"),
     "capture": ("capture/images.bin", "capture/journal.bin", "capture/plan.json"),
     "truth": ("twin/truth.npz",),
     "references": ("twin/references/*.exr",),
@@ -131,7 +131,7 @@ def drop_old_light(folder: RunFolder, key: str) -> None:
 
 def _drop(folder: RunFolder) -> None:
     old = [] if folder.taken_by_devices else [folder.capture / name for name in (IMAGES, JOURNAL, PLAN)]
-    old += [] if folder.taken_by_devices else [*folder.capture.glob("calibration/*/*")]
+    old += [] if folder.taken_by_devices else [*folder.capture.glob("calibration/**/*")]
     old += [*folder.twin.glob("responses/spots-*.npy"), *folder.twin.glob("references/*.exr")]
     old = [path for path in old if path.is_file()]
     if old:
@@ -152,7 +152,8 @@ def capture_stages(run: Run) -> None:
     drop_old_light(run.folder, key)
     scan_key = content_key(key, run.scene.relight.model_dump_json(include={"views"}))
     run.stage("scan", scan_key, lambda _: simulate.write_scan(run.world, run.folder.capture))
-    if run.scene.rig.faults.deviation:  # a rig that stands as its configuration says needs no calibration
+    rig = run.scene.rig
+    if rig.faults.deviation or rig.sensor.response == "curved":  # else there is nothing that images could tell
         run.stage(
             "targets",
             content_key(key, source_key("pipeline.capture.targets")),

@@ -73,9 +73,9 @@ def take_targets(world: World, folder: RunFolder, progress: Progress) -> None:
     """The calibration images, camera by camera, into the capture's folder; continues where it was interrupted."""
     from disco_twin.camera.targets import TargetSource
     from disco_twin.deviation import actual_rig
-    from disco_twin.rig import TargetRig
+    from disco_twin.rig import BracketRig, TargetRig
     from pipeline.capture.loop import capture
-    from pipeline.capture.targets import FOLDER, TARGETS, make_targets
+    from pipeline.capture.targets import BRACKET, FOLDER, TARGETS, make_bracket, make_targets
 
     rig, seed = world.scene.rig, world.scene.seed
     actual, made = actual_rig(rig, seed), [make_targets(rig, c) for c in range(len(rig.cameras))]
@@ -86,6 +86,10 @@ def take_targets(world: World, folder: RunFolder, progress: Progress) -> None:
         source = TargetSource(targets, actual.cameras[c], actual, rig.projector.beam_diameter_mm / 2)
         twin = TargetRig(rig, source, seed, actual, c, len(targets.placements))
         capture(twin, plan, own, partial(_later, progress, before, total))
+        if rig.sensor.response == "curved":
+            still, exposures = make_bracket(rig, c)
+            source = TargetSource(still, actual.cameras[c], actual, rig.projector.beam_diameter_mm / 2)
+            capture(BracketRig(rig, source, seed, actual, c, len(exposures.angles_rad)), exposures, own / BRACKET)
         write_atomically(own / TARGETS, targets.model_dump_json(indent=1).encode())
         before += len(plan)
 

@@ -34,6 +34,8 @@ class Sensor:
     responsivity: electrons per second per pixel for a radiance of 1 W/(mm^2 sr), one value per laser
     decision_e: a pixel stops at the first step that finds more than this charge in electrons (the longest exposure
         ends in any case); 0 where the exponent was not decided on the charge that is stored, as in a bracket
+    response: share of the full scale's charge that evenly spaced shares of the digital range (above the offset) stand
+        for, from 0 to 1; empty where both are the same. Below the offset it goes on as its mirror image
     """
 
     longest_exposure_s: float
@@ -45,6 +47,7 @@ class Sensor:
     offset_dn: float
     responsivity: tuple[float, ...]
     decision_e: float = 0.0
+    response: tuple[float, ...] = ()
 
     @property
     def saturation_dn(self) -> int:
@@ -73,9 +76,9 @@ def to_radiance(raw: RawImage, sensor: Sensor, laser: int) -> RadianceImage:
     """
     time = np.ldexp(sensor.longest_exposure_s, -raw.exponent.astype(np.int32))
     scale = 1.0 / (time * sensor.responsivity[laser])
-    electrons = (raw.charge.astype(np.float64) - sensor.offset_dn) * sensor.gain_e_per_dn
+    electrons, step = _electrons(raw.charge.astype(np.float64), sensor)
     dark = sensor.dark_e_per_s * time
-    noise = np.maximum(electrons, dark) + sensor.read_noise_e**2 + sensor.gain_e_per_dn**2 / 12.0
+    noise = np.maximum(electrons, dark) + sensor.read_noise_e**2 + step**2 / 12.0
     signal = electrons - dark
     if sensor.decision_e > 0:
         signal -= _decision_bias(electrons, raw.exponent, sensor)
@@ -84,6 +87,20 @@ def to_radiance(raw: RawImage, sensor: Sensor, laser: int) -> RadianceImage:
         (noise * scale**2).astype(np.float32),
         raw.charge >= sensor.saturation_dn,
     )
+
+
+def _electrons(charge: F64, sensor: Sensor) -> tuple[F64, F64 | float]:
+    """Digital numbers -> electrons, and how many electrons a digital number is wide there."""
+    if not sensor.response:
+        return (charge - sensor.offset_dn) * sensor.gain_e_per_dn, sensor.gain_e_per_dn
+    span, knots = sensor.saturation_dn - sensor.offset_dn, np.linspace(0.0, 1.0, len(sensor.response))
+
+    def linear(number: F64) -> F64:
+        share = (number - sensor.offset_dn) / span
+        return np.asarray(np.sign(share) * np.interp(np.abs(share), knots, sensor.response))
+
+    well = span * sensor.gain_e_per_dn
+    return linear(charge) * well, (linear(charge + 0.5) - linear(charge - 0.5)) * well
 
 
 def _decision_bias(electrons: F64, exponent: NDArray[np.uint8], sensor: Sensor) -> F64:

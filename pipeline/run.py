@@ -35,6 +35,7 @@ from pipeline.calibrate.figures import figures
 from pipeline.calibrate.fresnel import Boundary
 from pipeline.calibrate.measure import has_targets, measure
 from pipeline.capture.stream import StreamReader
+from pipeline.capture.targets import FOLDER
 from pipeline.config import Strict, read_json
 from pipeline.reconstruct.methods import METHODS, READINGS, reconstruct
 from pipeline.reconstruct.model import ReflectanceModel
@@ -220,6 +221,14 @@ def calibrate(
     if given is not None:
         return Calibration.load(given), {"source": "given"}
     if not has_targets(capture, rig):
+        if rig.sensor.response == "curved":
+            raise InputError(
+                "the camera is not linear, and there are no exposures to calibrate it from",
+                file=capture / FOLDER,
+                key="sensor.response",
+                value="curved",
+                remedy="photograph the targets",
+            )
         return nominal_calibration(rig, sensor), {"source": "nominal"}
     found = measure(capture, rig, sensor, mesh)
     return found.calibration, figures(found)

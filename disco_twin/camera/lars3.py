@@ -68,20 +68,24 @@ class Step:
 
 @dataclass(frozen=True)
 class Lars3:
-    """One camera. vignetting: (height, width) float32 transmission; glare: None where the lens has no flare."""
+    """One camera. vignetting: (height, width) float32 transmission; glare: None where the lens has no flare.
+
+    curved: whether digital numbers are compressed
+    """
 
     sensor: Sensor
     vignetting: NDArray[np.float32]
     glare: Glare | None = None
+    curved: bool = False
 
     @classmethod
     def of(cls, rig: RigConfig, camera: PinholeCamera) -> Lars3:
         """The twin's camera behind the lens of `camera`."""
         glare = Glare.of(camera.height, camera.width) if rig.faults.flare else None
-        return cls(lars3_sensor(rig), vignetting(camera), glare)
+        return cls(lars3_sensor(rig), vignetting(camera), glare, rig.sensor.response == "curved")
 
-    def steps(self, laser: int) -> tuple[Step, ...]:
-        """The way from radiance to digital numbers for light of one laser, in order."""
+    def steps(self, laser: int, exponent: int | None = None) -> tuple[Step, ...]:
+        """The way from radiance to digital numbers for light of one laser, in order; exponent: given to all pixels."""
         sensor = self.sensor
         glare = self.glare
         return (
@@ -89,15 +93,20 @@ class Lars3:
             Step("vignetting", "W/(mm^2 sr)", lambda x, _: x * self.vignetting),
             Step("photoelectrons", "e/s", lambda x, _: steps.photoelectrons(x, sensor, laser)),
             Step("dark signal", "e/s", lambda x, _: steps.add_dark(x, sensor)),
-            Step("shot noise and exposure decision", "exponent, e", lambda x, rng: steps.integrate(x, sensor, rng)),
+            Step("shot noise and exposure decision", "exponent, e", lambda x, rng: steps.integrate(x, sensor, rng))
+            if exponent is None
+            else Step("shot noise", "exponent, e", lambda x, rng: steps.integrate_for(x, sensor, exponent, rng)),
             Step("read noise", "exponent, e", lambda x, rng: steps.add_read_noise(x, sensor, rng)),
+            *((Step("compression", "exponent, e", lambda x, _: steps.compress(x, sensor)),) if self.curved else ()),
             Step("quantisation", "exponent, DN", lambda x, _: steps.quantise(x, sensor)),
         )
 
-    def expose(self, radiance: NDArray[np.float32], laser: int, rng: Generator) -> RawImage:
+    def expose(
+        self, radiance: NDArray[np.float32], laser: int, rng: Generator, exponent: int | None = None
+    ) -> RawImage:
         """(height, width) radiance in W/(mm^2 sr) on the lens's axis side -> the raw record."""
         image: Any = radiance
-        for step in self.steps(laser):
+        for step in self.steps(laser, exponent):
             image = step.apply(image, rng)
         assert isinstance(image, RawImage)
         return image

@@ -16,6 +16,8 @@ from hw.record import RawImage, Sensor
 
 F64 = NDArray[np.float64]
 
+GAMMA, FOOT = 2.2, 0.02  # of a camera whose response is "curved"
+
 
 class Exposed(NamedTuple):
     """exponent: int32, halvings of the longest exposure; charge: float64, electrons in the well."""
@@ -58,6 +60,26 @@ def add_read_noise(exposed: Exposed, sensor: Sensor, rng: Generator) -> Exposed:
     """Electrons -> electrons: the Gaussian noise of the read-out chain, independent of exposure and charge."""
     noise = rng.standard_normal(exposed.charge.shape)
     return Exposed(exposed.exponent, exposed.charge + sensor.read_noise_e * noise)
+
+
+def compress(exposed: Exposed, sensor: Sensor) -> Exposed:
+    """Electrons -> electrons that a linear camera would have to show the same: a gamma curve with a straight foot."""
+    well = (sensor.saturation_dn - sensor.offset_dn) * sensor.gain_e_per_dn
+    share = exposed.charge / well
+    return Exposed(exposed.exponent, well * np.sign(share) * gamma_curve(np.abs(share)))
+
+
+def gamma_curve(share: F64) -> F64:
+    """0..1 of the full well -> 0..1 of the digital range; the pipeline is not told."""
+    power = 1.0 / GAMMA
+    low, high = FOOT**power, (1.0 + FOOT) ** power
+    return np.asarray(((share + FOOT) ** power - low) / (high - low))
+
+
+def integrate_for(rate: F64, sensor: Sensor, exponent: int, rng: Generator) -> Exposed:
+    """Electrons per second -> the charge with shot noise after a time that all pixels were told."""
+    mean = np.minimum(np.ldexp(rate * sensor.longest_exposure_s, -exponent), 1e12)
+    return Exposed(np.full(rate.shape, exponent, np.int32), rng.poisson(mean).astype(np.float64))
 
 
 def quantise(exposed: Exposed, sensor: Sensor) -> RawImage:

@@ -27,6 +27,7 @@ def figures(found: Measured) -> dict[str, Any]:
     return {
         "source": found.calibration.source,
         "lenses": [_lens(name, c) for name, c in zip(names, found.cameras, strict=True)],
+        "response": _response(found),
         "photometric": _photometric(found, names),
         "silhouettes": {
             "residual_px": found.poses.residual_px,
@@ -53,6 +54,19 @@ def _lens(name: str, images: CameraImages) -> dict[str, Any]:
         "centre_error_px": _floats(error[1:3]),
         "k1": float(found.values[3]),
         "k1_error": float(error[3]),
+    }
+
+
+def _response(found: Measured) -> dict[str, Any] | None:
+    """Of a camera that is not linear: error as a share of the exposure, at worst above a fiftieth of the range."""
+    if found.response is None:
+        return None
+    response, low = found.response, len(found.response.exposure) // 50
+    middle = float(response.exposure[len(response.exposure) // 2])
+    return {
+        "exposure_at_half_range": middle,
+        "error_share": float((response.error[low:-1] / response.exposure[low:-1]).max()),
+        "chi2": response.chi2,
     }
 
 

@@ -35,9 +35,10 @@ from pipeline.calibrate.photometric import Balance, balance, pixel_areas
 from pipeline.calibrate.pose import PoseFit, fit_poses
 from pipeline.calibrate.projector import TwoMirrorProjector
 from pipeline.calibrate.projector_fit import GATE, ProjectorFit, StepSize, projection, refine, step_size
+from pipeline.calibrate.response import Response, fit_response
 from pipeline.capture.plan import ImageAddress
 from pipeline.capture.stream import CorruptImage, StreamReader
-from pipeline.capture.targets import FOLDER, TARGETS, Targets
+from pipeline.capture.targets import BRACKET, FOLDER, TARGETS, Targets
 from pipeline.rig import RigConfig
 
 F64 = NDArray[np.float64]
@@ -71,6 +72,7 @@ class Measured:
     poses: PoseFit
     projector: ProjectorFit
     step_size: StepSize
+    response: Response | None = None  # None: the camera is linear
 
 
 def has_targets(capture: Path, rig: RigConfig) -> bool:
@@ -80,6 +82,9 @@ def has_targets(capture: Path, rig: RigConfig) -> bool:
 
 def measure(capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh) -> Measured:
     """All stages. `mesh`: the scan, object frame, mm."""
+    response = measure_response(capture, rig, sensor) if rig.sensor.response == "curved" else None
+    if response is not None:
+        sensor = replace(sensor, response=tuple(float(x) for x in response.exposure))
     cameras = [read_targets(capture / FOLDER / c.name, rig, i, sensor) for i, c in enumerate(rig.cameras)]
     angles = [float(a) for a in np.deg2rad(rig.turntable_angles_deg)]
     with StreamReader(capture) as stream:
@@ -90,7 +95,19 @@ def measure(capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh
         watts = mean_power(stream)
     for text in poses.ambiguity:
         log.warning("the silhouettes leave open: %s", text)
-    return Measured(assemble(rig, sensor, cameras, poses, fit, watts), tuple(cameras), poses, fit, size)
+    return Measured(assemble(rig, sensor, cameras, poses, fit, watts), tuple(cameras), poses, fit, size, response)
+
+
+def measure_response(capture: Path, rig: RigConfig, sensor: Sensor) -> Response:
+    """From every camera's bracket of a board; the cameras are of one make and share one response."""
+    images: list[list[NDArray[np.uint16]]] = []
+    for camera in rig.cameras:
+        with StreamReader(capture / FOLDER / camera.name / BRACKET) as stream:
+            stream.require_complete()
+            images.append([_intact(raw).charge for raw in stream])
+    seconds = [sensor.longest_exposure_s * 2.0**-k for k in range(len(images[0]))]
+    together = [np.concatenate([np.ravel(i) for i in same]) for same in zip(*images, strict=True)]
+    return fit_response(together, seconds, sensor)
 
 
 def _intact(raw: RawImage | CorruptImage) -> RawImage:

@@ -28,6 +28,7 @@ Pose = tuple[Row, Row, Row, Row]
 
 TARGETS = "targets.json"
 FOLDER = "calibration"  # in the capture's folder
+BRACKET = "bracket"  # in a camera's folder there: exposures of a board, where the camera is not linear
 
 BOARDS = 24  # 12 know the focal length to .06 %, but in a lab some are lost
 TILT_DEG = 45.0  # of most boards: perspective, and with it the focal length, shows in tilted planes only
@@ -95,6 +96,15 @@ def make_targets(rig: RigConfig, camera: int) -> tuple[Targets, Plan]:
     lit = [(i, p) for i, p in enumerate(placements) if p.kind == "white"]
     spots = tuple(aim for i, p in lit for aim in _plate_aims(rig, config, np.array(p.pose), i))
     return targets, Plan((config.name,), tuple(float(i) for i in range(len(placements))), spots, len(rig.lasers))
+
+
+def make_bracket(rig: RigConfig, camera: int) -> tuple[Targets, Plan]:
+    """A board under the floodlight, once for each exposure: its white, its black and the greys along their borders."""
+    config, (targets, _) = rig.cameras[camera], make_targets(rig, camera)
+    board = Placement(kind="board", mount=2, pose=_rows(_board_pose(config, 3)))
+    still = targets.model_copy(update={"placements": (board,) * rig.sensor.steps})
+    angles = tuple(float(k) for k in range(rig.sensor.steps))
+    return still, Plan((config.name,), angles, (), len(rig.lasers))
 
 
 def width_mm(config: CameraConfig) -> float:

@@ -73,6 +73,8 @@ def omissions(samples: Samples, calibration: Calibration) -> list[Omission]:
     out = []
     if calibration.source == "nominal":
         out.append(Omission("pose and projector estimation", "the calibration holds the nominal rig's geometry"))
+    if not calibration.sensor.response:
+        out.append(Omission("response calibration", "the camera's digital numbers are linear by its data sheet"))
     if is_opaque(samples):
         share = share_within_an_edge(samples)
         out.append(Omission("global term", f"{share:.1%} of the light leaves within one edge of its spot: opaque"))

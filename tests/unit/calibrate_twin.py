@@ -16,7 +16,7 @@ from disco_twin.camera.lars3 import Lars3, lars3_sensor
 from disco_twin.camera.targets import TargetSource
 from disco_twin.deviation import ActualRig, actual_rig
 from disco_twin.faults import Stream, generator
-from disco_twin.rig import TargetRig, TwinRig
+from disco_twin.rig import BracketRig, TargetRig, TwinRig
 from disco_twin.scene import load_scene
 from disco_twin.world import World
 from hw.interface import Aim
@@ -24,7 +24,7 @@ from hw.record import to_radiance
 from pipeline.calibrate.camera import PinholeCamera
 from pipeline.capture.loop import capture
 from pipeline.capture.plan import make_plan
-from pipeline.capture.targets import FOLDER, TARGETS, Targets, make_targets, save_targets
+from pipeline.capture.targets import BRACKET, FOLDER, TARGETS, Targets, make_bracket, make_targets, save_targets
 from pipeline.rig import RigConfig
 
 F64 = NDArray[np.float64]
@@ -151,11 +151,15 @@ class Glowing:
         return np.asarray(fine.mean(axis=(1, 3)), np.float32)
 
 
-def capture_all(folder: Path, seed: int, spots: int = 90, mesh: trimesh.Trimesh | None = None) -> RigConfig:
+def capture_all(
+    folder: Path, seed: int, spots: int = 90, mesh: trimesh.Trimesh | None = None, curved: bool = False
+) -> RigConfig:
     """A whole capture of the quick scene's object by a seeded rig, calibration images included; the nominal rig."""
     rig = faulty_rig()
     on = dict.fromkeys(("warm_up", "blue_noise", "mode_hop", "speckle"), True)
     rig = rig.model_copy(update={"faults": rig.faults.model_copy(update=on), "spots": spots})
+    if curved:
+        rig = rig.model_copy(update={"sensor": rig.sensor.model_copy(update={"response": "curved"})})
     actual = actual_rig(rig, seed)
     for c, lens in enumerate(actual.cameras):
         targets, plan = make_targets(rig, c)
@@ -163,6 +167,10 @@ def capture_all(folder: Path, seed: int, spots: int = 90, mesh: trimesh.Trimesh 
         source = TargetSource(targets, lens, actual, rig.projector.beam_diameter_mm / 2)
         capture(TargetRig(rig, source, seed, actual, c, len(targets.placements)), plan, own)
         save_targets(targets, own / TARGETS)
+        if curved:
+            still, exposures = make_bracket(rig, c)
+            source = TargetSource(still, lens, actual, rig.projector.beam_diameter_mm / 2)
+            capture(BracketRig(rig, source, seed, actual, c, len(still.placements)), exposures, own / BRACKET)
     source = Glowing(rig, actual, mesh or world().object.mesh)
     capture(TwinRig(rig, source, seed, actual), make_plan(rig, world().scan), folder)
     return rig

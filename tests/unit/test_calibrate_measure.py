@@ -153,6 +153,20 @@ def test_the_power_of_every_image_is_known(captured: tuple[Path, RigConfig]) -> 
 
 
 @pytest.mark.slow
+def test_a_rig_with_curved_cameras_is_calibrated_as_well(tmp_path: Path) -> None:
+    """The same bounds as for linear ones, from brackets that the cameras took; the calibration holds the response."""
+    rig = capture_all(tmp_path, 11, curved=True)
+    found = measure(tmp_path, rig, lars3_sensor(rig), world().object.mesh)
+    judged = judge(found, rig, 11, tmp_path)
+    assert judged.spots_mm < 0.15
+    assert judged.incidence_deg < 0.3
+    assert judged.balance < 0.01
+    assert all(np.abs(z).max() < 6 for z in judged.scores.values())
+    assert len(found.calibration.sensor.response) > 100
+    assert figures(found)["response"]["error_share"] < 0.005
+
+
+@pytest.mark.slow
 @pytest.mark.timeout(1500)
 def test_uncertainties_are_honest(tmp_path: Path) -> None:
     """Twelve rigs: z-scores have a root mean square between .8 and 1.25 for poses, between .7 and 1.25 for the balance.

@@ -1,4 +1,4 @@
-"""White balance and laser power, response curves, spot peaks, and the scanned surface."""
+"""White balance and laser power, spot peaks, and the scanned surface."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ from calibrate_twin import faulty_rig, world
 
 from disco_twin.faults import LaserPower
 from disco_twin.object.scanner import LARGEST_MM, NOISE_MM, geometry_error, scan_points
-from hw.errors import InputError
 from pipeline.calibrate.camera import PinholeCamera
 from pipeline.calibrate.geometry import reconstruct_surface
 from pipeline.calibrate.peaks import brightness, find_peak, footprint, seen
 from pipeline.calibrate.photometric import balance, pixel_areas
-from pipeline.calibrate.response import linearised, response_curve
 
 
 def test_areas_of_pixels_add_up_to_the_plane() -> None:
@@ -51,29 +49,6 @@ def test_power_is_known_although_it_drifts() -> None:
     broken = balance(light, reading[::-1], np.full(3, 0.5), np.repeat([0, 1], 40))  # lasers in the wrong order
     assert np.abs(broken.factor * gain / 0.97 - 1).max() > 0.005
     assert (balance(light, np.full_like(reading, 0.01), np.full(3, 0.5), np.repeat([0, 1], 40)).scatter > 0.005).any()
-
-
-def test_the_response_of_a_gamma_camera_is_found() -> None:
-    rng = np.random.default_rng(1)
-    scene = np.exp(rng.uniform(np.log(0.02), np.log(2.0), (60, 80)))
-    seconds = [2.0**k for k in range(-3, 3)]
-    images = [np.clip(255 * np.clip(scene * t, 0, 1) ** (1 / 2.2) + 0.5, 0, 255).astype(np.uint8) for t in seconds]
-    curve = response_curve(images, seconds)
-    numbers = np.arange(30, 230)
-    truth = (numbers / 128.0) ** 2.2
-    assert np.abs(np.log(curve[numbers] / truth)).max() < 0.08
-    one = linearised(images[3], curve)
-    middle = (images[3] > 40) & (images[3] < 220)
-    ratio = one[middle] / scene[middle]
-    assert ratio.std() / ratio.mean() < 0.05
-
-
-def test_a_bracket_that_says_nothing_is_refused() -> None:
-    flat = np.full((20, 20), 100, np.uint8)
-    with pytest.raises(InputError, match="too few"):
-        response_curve([flat], [1.0])
-    with pytest.raises(InputError, match="cover"):
-        response_curve([flat] * 3, [1.0, 2.0, 4.0])
 
 
 def blob(x: float, y: float, width: float, height: float, shape: tuple[int, int] = (60, 80)) -> np.ndarray:

@@ -162,6 +162,7 @@ MEASURED = {
             "k1_error": 0.031,
         }
     ],
+    "response": {"exposure_at_half_range": 0.24, "error_share": 0.0017, "chi2": 1.0},
     "photometric": {
         "white_balance": {"front": [0.9915]},
         "white_balance_error": {"front": [0.0031]},
@@ -201,6 +202,7 @@ def test_the_calibration_is_told_with_its_uncertainty() -> None:
     for shown in (
         "1405.4 +- 2.7 px (0.19%)",
         "0.9915 +- 0.0031",
+        "known to 0.17%",
         "drifted by 35%",
         "+- 0.43 mm across, +- 0.86 mm along the axis, +- 0.087 deg",
         "tilt -0.011 +- 0.015, 0.013 +- 0.012 deg",

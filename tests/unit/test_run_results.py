@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reconstruct_capture import rig, write_capture
+from reconstruct_capture import SENSOR, rig, write_capture
 from rich.console import Console
 from test_run_report import METHODS, fake_data
 
@@ -59,7 +59,7 @@ def test_the_report_and_the_table_show_a_dash_where_there_is_no_score() -> None:
 def test_the_report_leaves_out_a_spot_whose_image_is_damaged(tmp_path: Path) -> None:
     capture = tmp_path / "capture"
     write_capture(capture)
-    whole, damaged = impulses(rig(), capture)
+    whole, damaged = impulses(rig(), capture, SENSOR)
     assert [len(row) for row in whole] == [SPOTS_SHOWN] * 2
     assert not damaged
     with StreamReader(capture) as stream:
@@ -74,7 +74,7 @@ def test_the_report_leaves_out_a_spot_whose_image_is_damaged(tmp_path: Path) -> 
         file.write(bytes([byte ^ 4]))
     with StreamReader(capture) as stream:
         assert [c.index for c in stream.verify()] == [index]
-    rest, damaged = impulses(rig(), capture)
+    rest, damaged = impulses(rig(), capture, SENSOR)
     assert [[i.spot for i in row] for row in rest] == [[i.spot for i in row if i.spot != spot] for row in whole]
     assert len(damaged) == 1
     assert f"spot {spot} is not shown: image {index}" in damaged[0]

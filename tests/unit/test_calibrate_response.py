@@ -1,0 +1,135 @@
+"""The response of a camera that is not linear: the true curve, OpenCV's estimate, and the twin's own bracket."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from calibrate_twin import faulty_rig
+from numpy.typing import NDArray
+
+from disco_twin.camera.lars3 import Lars3, lars3_sensor
+from disco_twin.camera.sensor import gamma_curve
+from disco_twin.camera.targets import TargetSource
+from disco_twin.deviation import actual_rig
+from disco_twin.rig import BracketRig
+from hw.errors import InputError
+from hw.record import Sensor, to_radiance
+from pipeline.calibrate.measure import measure_response
+from pipeline.calibrate.response import TABLE, Response, fit_response
+from pipeline.capture.loop import capture
+from pipeline.capture.targets import BRACKET, FOLDER, make_bracket
+
+F64 = NDArray[np.float64]
+
+SENSOR = Sensor(1 / 30, 12, 12, 100_000 / 4031, 25.0, 500.0, 64.0, (1e12,))
+SPAN = SENSOR.saturation_dn - SENSOR.offset_dn
+SECONDS = [2.0**-k for k in range(12)]
+CURVES: dict[str, Callable[[F64], F64]] = {
+    "gamma": gamma_curve,
+    "logarithmic": lambda share: np.asarray(np.log1p(8 * share) / np.log1p(8.0)),
+    "linear": lambda share: share,
+}
+
+
+def bracket(curve: Callable[[F64], F64], seed: int, bits: int = 12) -> list[NDArray[np.uint16]]:
+    """Black, white and greys, with the noise of charge and of reading out."""
+    rng, well = np.random.default_rng(seed), SPAN * SENSOR.gain_e_per_dn
+    light = np.where(rng.random(24_000) < 0.2, rng.uniform(0.04, 0.9, 24_000), rng.choice([0.04, 0.9], 24_000)) * 33
+    images = []
+    for seconds in SECONDS:
+        share = (rng.poisson(np.minimum(light * seconds * well, 1e9)) + 25 * rng.standard_normal(len(light))) / well
+        number = np.rint(SENSOR.offset_dn + SPAN * np.sign(share) * curve(np.abs(share)))
+        images.append(np.clip(number, 0, 4095).astype(np.uint16).reshape(120, 200) >> (12 - bits))
+    return images
+
+
+def truth(curve: Callable[[F64], F64]) -> F64:
+    """(TABLE,) share of the full well for evenly spaced shares of the digital range."""
+    dense = np.linspace(0, 1, 100_001)
+    return np.interp(np.linspace(0, 1, TABLE), curve(dense), dense)
+
+
+def share_off(found: Response, curve: Callable[[F64], F64]) -> F64:
+    """Error as a share of the exposure, from a fiftieth of the range on."""
+    return np.abs(found.exposure[5:] / truth(curve)[5:] - 1)
+
+
+@pytest.mark.parametrize("name", CURVES)
+def test_the_true_response_is_found_with_honest_errors(name: str) -> None:
+    """Expected: within 1 % from a fiftieth of the range on; z-scores of four brackets have an rms near one.
+
+    The errors of one bracket's curve are one or two numbers (steepness, scale at the full well): few in all.
+    """
+    scores = []
+    for seed in range(4):
+        found = fit_response(bracket(CURVES[name], seed), SECONDS, SENSOR)
+        assert share_off(found, CURVES[name]).max() < 0.01
+        assert found.chi2 == pytest.approx(1.0, abs=0.05)
+        scores.append(((found.exposure - truth(CURVES[name])) / np.maximum(found.error, 1e-12))[8:-16:8])
+    assert 0.5 < np.sqrt((np.array(scores) ** 2).mean()) < 1.8
+
+
+def test_a_broken_bracket_shows() -> None:
+    """Exposures in the wrong order, doubled where they were halved twice, or without the offset: off or refused."""
+    images, curve = bracket(gamma_curve, 1), CURVES["gamma"]
+    good = share_off(fit_response(images, SECONDS, SENSOR), curve).max()
+    for broken in (
+        lambda: fit_response(images[::-1], SECONDS, SENSOR),
+        lambda: fit_response(images, [t**0.5 for t in SECONDS], SENSOR),
+        lambda: fit_response([i + 64 for i in images], SECONDS, SENSOR),
+    ):
+        try:
+            found = broken()
+        except (InputError, np.linalg.LinAlgError):
+            continue
+        assert share_off(found, curve).max() > 10 * good or found.chi2 > 10
+
+
+def test_opencvs_estimate_agrees_in_the_middle() -> None:
+    """An independent program (Debevec and Malik) on the same bracket with eight bits; its scale is its own."""
+    stack = [np.repeat(i.astype(np.uint8)[:, :, None], 3, axis=2) for i in bracket(gamma_curve, 2, bits=8)]
+    solver = cv2.createCalibrateDebevec(samples=200, lambda_=20.0, random=False)
+    theirs = np.asarray(solver.process(stack, times=np.asarray(SECONDS, np.float32)), np.float64)[:, 0, 0]
+    numbers = np.arange(60, 230)
+    ours = np.interp(
+        (numbers * 16 + 7.5 - SENSOR.offset_dn) / SPAN,
+        np.linspace(0, 1, TABLE),
+        fit_response(bracket(gamma_curve, 2), SECONDS, SENSOR).exposure,
+    )
+    ratio = theirs[numbers] / ours
+    assert np.abs(ratio / np.median(ratio) - 1).max() < 0.1
+
+
+def test_a_bracket_that_says_nothing_is_refused() -> None:
+    with pytest.raises(InputError, match=r"do not cover.*Remedy"):
+        fit_response([np.full((20, 20), 100, np.uint16)] * 3, [1.0, 2.0, 4.0], SENSOR)
+
+
+def test_a_curved_camera_of_the_twin_means_radiance_after_its_bracket(tmp_path: Path) -> None:
+    """Rationale: sensor.json knows no curve. Expected: radiances to 1 % (read linearly: 13 to 300 % off)."""
+    rig = faulty_rig()
+    rig = rig.model_copy(
+        update={"sensor": rig.sensor.model_copy(update={"response": "curved"}), "cameras": rig.cameras[:1]}
+    )
+    actual, sensor = actual_rig(rig, 3), lars3_sensor(rig)
+    assert not sensor.response
+    targets, plan = make_bracket(rig, 0)
+    source = TargetSource(targets, actual.cameras[0], actual, 1.0)
+    folder = tmp_path / FOLDER / rig.cameras[0].name / BRACKET
+    capture(BracketRig(rig, source, 3, actual, 0, len(targets.placements)), plan, folder)
+    found = measure_response(tmp_path, rig, sensor)
+    assert np.abs(found.exposure[5:] / truth(gamma_curve)[5:] - 1).max() < 0.01
+    optics = replace(Lars3.of(rig, actual.cameras[0]), glare=None, vignetting=np.ones((124, 192), np.float32))
+    known = replace(sensor, response=tuple(found.exposure.tolist()))
+    for level in (1e-8, 3e-7, 1e-5, 3e-4):
+        raw = optics.expose(np.full((124, 192), level, np.float32), 0, np.random.default_rng(1))
+        image = to_radiance(raw, known, 0)
+        assert image.radiance.mean() == pytest.approx(level, rel=0.01)
+        assert abs(to_radiance(raw, sensor, 0).radiance.mean() / level - 1) > 0.1
+        pull = (image.radiance - image.radiance.mean()) / np.sqrt(image.variance)
+        assert 0.9 < pull.std() < 1.1
