@@ -17,6 +17,7 @@ from scipy import ndimage
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from hw.errors import DiscoError
 from pipeline.calibrate.camera import PinholeCamera, turn
 from pipeline.calibrate.outline import Outline, edges_along, mesh_mask, object_mask, outline, signed_distance, synthetic
 
@@ -254,6 +255,11 @@ def _fine(
     for last in range(FINE_STEPS):
         rows = [_edges_of(sweep, v, image, mesh, last >= FINE_STEPS - EXACT_STEPS) for v, image in enumerate(images)]
         j, rest, length, sector = (np.concatenate([r[k] for r in rows]) for k in range(4))
+        if not len(rest):
+            raise DiscoError(
+                "the silhouettes show no edge near the scan's outline. Remedy: check that the scan is of this object, "
+                "in mm and in the object's frame"
+            )
         weight = length / np.maximum(np.abs(rest) / HUBER_FINE_PX, 1.0)
         variance = float((weight * rest**2).sum() / weight.sum())
         hessian = j.T @ (j * weight[:, None]) / variance

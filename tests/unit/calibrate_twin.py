@@ -151,22 +151,34 @@ class Glowing:
         return np.asarray(fine.mean(axis=(1, 3)), np.float32)
 
 
+def flickering_rig() -> RigConfig:
+    """`faulty_rig` with all faults of the light."""
+    rig = faulty_rig()
+    on = dict.fromkeys(("warm_up", "blue_noise", "mode_hop", "speckle"), True)
+    return rig.model_copy(update={"faults": rig.faults.model_copy(update=on)})
+
+
+def capture_targets(folder: Path, rig: RigConfig, seed: int, camera: int) -> tuple[Targets, TargetSource]:
+    """A camera's boards and white plate before a seeded rig; the source knows where they really stood."""
+    actual = actual_rig(rig, seed)
+    targets, plan = make_targets(rig, camera)
+    source = TargetSource(targets, actual.cameras[camera], actual, rig.projector.beam_diameter_mm / 2)
+    capture(TargetRig(rig, source, seed, actual, camera, len(targets.placements)), plan, folder)
+    save_targets(targets, folder / TARGETS)
+    return targets, source
+
+
 def capture_all(
     folder: Path, seed: int, spots: int = 90, mesh: trimesh.Trimesh | None = None, curved: bool = False
 ) -> RigConfig:
     """A whole capture of the quick scene's object by a seeded rig, calibration images included; the nominal rig."""
-    rig = faulty_rig()
-    on = dict.fromkeys(("warm_up", "blue_noise", "mode_hop", "speckle"), True)
-    rig = rig.model_copy(update={"faults": rig.faults.model_copy(update=on), "spots": spots})
+    rig = flickering_rig().model_copy(update={"spots": spots})
     if curved:
         rig = rig.model_copy(update={"sensor": rig.sensor.model_copy(update={"response": "curved"})})
     actual = actual_rig(rig, seed)
     for c, lens in enumerate(actual.cameras):
-        targets, plan = make_targets(rig, c)
-        own = folder / FOLDER / targets.camera
-        source = TargetSource(targets, lens, actual, rig.projector.beam_diameter_mm / 2)
-        capture(TargetRig(rig, source, seed, actual, c, len(targets.placements)), plan, own)
-        save_targets(targets, own / TARGETS)
+        own = folder / FOLDER / rig.cameras[c].name
+        capture_targets(own, rig, seed, c)
         if curved:
             still, exposures = make_bracket(rig, c)
             source = TargetSource(still, lens, actual, rig.projector.beam_diameter_mm / 2)

@@ -1,0 +1,167 @@
+"""Slips on purpose between a calibration and its samples: the samples' own score sees each of them.
+
+The score is the root mean square of log(measured / true R_d) over a sphere whose R_d is known. A slip has to raise it
+by the factor that stands beside it, over what the unbroken chain scores in the same test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+from reconstruct_capture import ETA, SENSOR, reflectance, rig, write_capture
+
+from hw.record import RawImage
+from pipeline.calibrate.calibration import Calibration, nominal_calibration
+from pipeline.calibrate.camera import PinholeCamera
+from pipeline.calibrate.fresnel import transmittance
+from pipeline.capture.stream import StreamReader
+from pipeline.reconstruct import resample, spots, views
+from pipeline.reconstruct.samples import take_samples
+from pipeline.reconstruct.settings import ReconstructConfig
+
+F64 = NDArray[np.float64]
+FACTORS = (1.2, 0.9)  # of a camera that shows too little and too much: white balance is not one here
+
+Patch = pytest.MonkeyPatch
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, trimesh.Trimesh]:
+    folder = tmp_path_factory.mktemp("run") / "capture"
+    return folder, write_capture(folder, 3)
+
+
+def score(captured: tuple[Path, trimesh.Trimesh]) -> float:
+    """rms of log(measured / true) within 15 mm; nothing measured, or nothing positive, is as bad as can be."""
+    folder, mesh = captured
+    settings = ReconstructConfig(eta=ETA)
+    nominal = nominal_calibration(rig(), SENSOR)
+    balanced = tuple(v.model_copy(update={"radiance_factor": FACTORS}) for v in nominal.views)
+    calibration = nominal.model_copy(update={"views": balanced})
+    with StreamReader(folder) as stream:
+        readings = [
+            views.footprint_reading(mesh, calibration.view_camera(v), ETA, settings.max_view_deg)
+            for v in range(stream.plan.views)
+        ]
+        samples, _ = take_samples(stream, calibration, mesh, {"it": readings}, settings)
+    value, at = samples["it"].values, samples["it"].spots.position
+    distance = np.linalg.norm(at[:, None] - mesh.vertices, axis=2)
+    true = np.stack([reflectance(distance, k) * FACTORS[k] for k in range(2)])
+    near = np.isfinite(value) & (distance < 15.0)
+    if near.mean() < 0.05 or (value[near] <= 0).mean() > 0.2:
+        return np.inf
+    return float(np.sqrt((np.log(np.maximum(value, 1e-9) / true)[near] ** 2).mean()))
+
+
+def pixels_moved(move: Callable[[F64, PinholeCamera], F64]) -> Callable[[Patch], None]:
+    def slip(patch: Patch) -> None:
+        rays = PinholeCamera.rays
+        patch.setattr(PinholeCamera, "rays", lambda self, pixels: rays(self, move(np.asarray(pixels), self)))
+
+    return slip
+
+
+def transposed_pose(patch: Patch) -> None:
+    rays = PinholeCamera.rays
+
+    def broken(self: PinholeCamera, pixels: F64) -> tuple[F64, F64]:
+        origins, directions = rays(self, pixels)
+        return origins, directions @ self.pose[:3, :3].T @ self.pose[:3, :3].T
+
+    patch.setattr(PinholeCamera, "rays", broken)
+
+
+def towards_the_camera(patch: Patch) -> None:
+    patch.setattr(views, "transmittance", lambda cosine, eta: np.ones_like(cosine))
+
+
+def degrees_for_radians(patch: Patch) -> None:
+    patch.setattr(
+        views, "transmittance", lambda cosine, eta: transmittance(np.cos(np.rad2deg(np.arccos(cosine))), eta).clip(0.1)
+    )
+
+
+def towards_the_laser(patch: Patch) -> None:
+    real = spots.transmittance
+    patch.setattr(spots, "transmittance", lambda cosine, eta: real(cosine, eta) ** 2)
+
+
+def exponent_of_the_wrong_sign(patch: Patch) -> None:
+    real = resample.to_radiance
+    patch.setattr(
+        resample,
+        "to_radiance",
+        lambda raw, *more: real(RawImage(11 - raw.exponent.astype(np.uint8), raw.charge), *more),
+    )
+
+
+def no_offset(patch: Patch) -> None:
+    real = resample.to_radiance
+    patch.setattr(resample, "to_radiance", lambda raw, sensor, k: real(raw, replace(sensor, offset_dn=0.0), k))
+
+
+def no_white_balance(patch: Patch) -> None:
+    patch.setattr(Calibration, "factor", lambda *_: 1.0)
+
+
+def window_shifted(pixels: int) -> Callable[[Patch], None]:
+    def slip(patch: Patch) -> None:
+        real = resample.Sight.of.__func__
+
+        def broken(cls: type, *arguments: object) -> resample.Sight:
+            sight = real(cls, *arguments)
+            rows, columns = sight.window
+            moved = slice(columns.start + pixels, columns.stop + pixels)
+            return replace(sight, window=(rows, moved))
+
+        patch.setattr(resample.Sight, "of", classmethod(broken))
+
+    return slip
+
+
+def rays_changed(change: Callable[[F64, F64], tuple[F64, F64]]) -> Callable[[Patch], None]:
+    def slip(patch: Patch) -> None:
+        real = Calibration.spot_rays
+        patch.setattr(Calibration, "spot_rays", lambda self, aims: change(*real(self, aims)))
+
+    return slip
+
+
+def mirrors_swapped(patch: Patch) -> None:
+    real = Calibration.spot_rays
+    patch.setattr(Calibration, "spot_rays", lambda self, aims: real(self, [replace(a, u=a.v, v=a.u) for a in aims]))
+
+
+SLIPS: dict[str, tuple[float, Callable[[Patch], None]]] = {
+    "map: rows for columns": (20, pixels_moved(lambda p, c: p[:, ::-1] + c.centre - c.centre[::-1])),
+    "map: down is up": (20, pixels_moved(lambda p, c: np.column_stack([p[:, 0], c.height - p[:, 1]]))),
+    "map: half a pixel": (1.7, pixels_moved(lambda p, c: p + 0.5)),
+    "map: pose transposed": (5, transposed_pose),
+    "map: no transmittance to the camera": (1.5, towards_the_camera),
+    "map: degrees for radians": (20, degrees_for_radians),
+    "spots: transmittance squared": (1.5, towards_the_laser),
+    "spots: mirrors swapped": (5, mirrors_swapped),
+    "spots: turned the wrong way": (5, rays_changed(lambda o, d: (o * [1, -1, 1], d * [1, -1, 1]))),
+    "resampling: exponent's sign": (20, exponent_of_the_wrong_sign),
+    "resampling: no offset": (1.3, no_offset),
+    "resampling: no white balance": (3, no_white_balance),
+    "resampling: window beside": (5, window_shifted(3)),
+}
+
+
+@pytest.mark.parametrize("name", SLIPS)
+def test_a_slip_shows_in_the_samples(
+    name: str, captured: tuple[Path, trimesh.Trimesh], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = score(captured)
+    assert good < 0.05
+    factor, slip = SLIPS[name]
+    slip(monkeypatch)
+    bad = score(captured)
+    assert bad > factor * good
