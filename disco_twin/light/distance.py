@@ -1,8 +1,9 @@
 """Conservative distance field: a lower bound of the distance to the surface, on a regular grid.
 
-A distance is 1-Lipschitz, so a flight of length l from p to q cannot cross the surface if l < d(p) + d(q): the two
-empty balls overlap. Neither ball holds surface, so no inside test is needed, and open, thin, nested and concave shapes
-are handled alike. The bound holds for the mesh itself, not for samples of it (see `build_distance_field`).
+A distance is 1-Lipschitz, so it is known to within the way to the nearest cell's centre, and a flight of length l
+from p to q cannot cross the surface if l < d(p) + d(q): the two empty balls overlap. Neither ball holds surface, so no
+inside test is needed, and open, thin, nested and concave shapes are handled alike. The bound holds for the mesh itself,
+not for samples of it (see `build_distance_field`).
 """
 
 from __future__ import annotations
@@ -15,12 +16,16 @@ import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from disco_twin.object.mesh import distance_to
+
 F32 = NDArray[np.float32]
+
+NEAR = 8.0  # cells from the surface within which distances are exact
 
 
 @dataclass(frozen=True)
 class DistanceField:
-    """distance: (n, n, n) float32 in mm, index [z, y, x], a lower bound valid in the whole cell, 0 at the grid's rim;
+    """distance: (n, n, n) float32 in mm, index [z, y, x], a lower bound at the cell's centre, 0 at the grid's rim;
     normal: (n, n, n, 3) float32, outward unit normal of the nearest surface; low: (3,) corner; cell: edge in mm.
     """
 
@@ -62,8 +67,8 @@ def sample_surface(mesh: trimesh.Trimesh, spacing: float) -> tuple[NDArray[np.fl
 def build_distance_field(mesh: trimesh.Trimesh, cells: int = 128) -> DistanceField:
     """Lower bound of the distance to `mesh` on a cube of `cells`^3 cells around it.
 
-    From the Euclidean distance transform between cell centres, less everything that it can overstate: half a diagonal
-    for the query's place in its cell, half a diagonal for the sample's, and the spacing of the samples.
+    Exact in the cells near the surface. Deeper ones take the Euclidean distance transform between cell centres, less
+    what it can overstate: half a diagonal for the sample's place in its cell, and the spacing of the samples.
     """
     low, high = np.asarray(mesh.bounds, float)
     extent = float((high - low).max())
@@ -79,12 +84,19 @@ def build_distance_field(mesh: trimesh.Trimesh, cells: int = 128) -> DistanceFie
     for axis in range(3):
         summed[:, axis] = np.bincount(flat, np.asarray(mesh.face_normals)[faces, axis], minlength=cells**3)
     steps, nearest = ndimage.distance_transform_edt(~touched.reshape((cells,) * 3), return_indices=True)
-    distance = np.maximum(steps * cell - cell * math.sqrt(3.0) - spacing, 0.0)
+    distance = np.maximum(steps * cell - cell * math.sqrt(3.0) / 2 - spacing, 0.0)
+    normal = summed[(nearest[0] * cells + nearest[1]) * cells + nearest[2]]
+    near = np.argwhere(steps <= NEAR)
+    # Light flies inside: cells that are surely outside keep their bound.
+    away = (near - nearest[:, near[:, 0], near[:, 1], near[:, 2]].T)[:, ::-1]
+    facing = np.einsum("nk,nk->n", away, normal[tuple(near.T)])
+    near = near[(facing <= 0) | (steps[tuple(near.T)] < 2)]
+    exact = distance_to(mesh, corner + (near[:, ::-1] + 0.5) * cell)
+    # Single precision, here and where the walk looks up its cell.
+    distance[tuple(near.T)] = np.maximum(exact - 1e-5 * extent, 0.0)
     for axis in range(3):
         for rim in (0, -1):
             np.moveaxis(distance, axis, 0)[rim] = 0.0  # a look-up outside the grid is clamped to its rim
-    normal = summed[(nearest[0] * cells + nearest[1]) * cells + nearest[2]]
-    for axis in range(3):
         normal[..., axis] = ndimage.gaussian_filter(normal[..., axis], 1.5, truncate=2.0)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
     return DistanceField(distance.astype(np.float32), normal.astype(np.float32), corner, cell)

@@ -11,6 +11,7 @@ light, the lighter its carriers.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +26,7 @@ F64 = NDArray[np.float64]
 
 CELLS = 32  # along the object's longest side
 INNER_POINTS = 3  # of each cell and axis, at which the medium is read
-FAINTEST = 1e-7  # of the launched power, the least target weight
+DARKEST = 3e-6  # of the brightest fluence, which R_d follows: 1e-5 of the peak is what is asked for, and then some
 STEEPEST = 32.0  # ratio of neighbouring cells' targets: where diffusion falls too fast, photons must not burst
 
 
@@ -128,16 +129,22 @@ def diffusion(obj: TwinObject, laser: int, cells: int = CELLS) -> Diffusion:
 def window_targets(fluence: F64, filled: NDArray[np.bool_], effort: float) -> F64:
     """(N, n, n, n) target weights: min(1, fluence / f), with the f at which `effort` times the collisions are made.
 
-    Photons of weight w are met fluence / w times: the fluence itself without windows, and max(fluence, f) with them.
+    Photons of weight w are met fluence / w times: the fluence itself without windows, and max(fluence, f) with them,
+    down to where the light is DARKEST; still fainter light is left to itself.
     """
     targets = np.empty_like(fluence)
     for target, values in zip(targets, fluence, strict=True):
-        faint = np.sort(values[filled])
-        # With f at the k-th faintest of N cells the sum of the maxima is k f + the sum of the brighter ones.
-        sums = np.arange(len(faint)) * faint + np.cumsum(faint[::-1])[::-1]
-        k = int(np.searchsorted(sums, effort * faint.sum()))
-        level = faint[-1] if k == len(faint) else faint[k]
-        target[...] = np.clip(values / level, FAINTEST, 1.0)
+        inside = values[filled]
+        kept = np.maximum(values, DARKEST * inside.max())
+
+        def collisions(level: float, inside: F64 = inside, kept: F64 = kept[filled]) -> float:
+            return float((inside / np.minimum(kept / level, 1.0)).sum())
+
+        low, high = float(kept[filled].min()), float(inside.max())
+        for _ in range(30):
+            level = math.sqrt(low * high)
+            low, high = (low, level) if collisions(level) > effort * inside.sum() else (level, high)
+        target[...] = np.minimum(kept / low, 1.0)
         np.maximum(target, ndimage.maximum_filter(target, 3) / STEEPEST, out=target)
     # In steps of a quarter octave: the solver's last bit must not decide about a photon.
     return np.exp2(np.round(4 * np.log2(targets)) / 4)

@@ -13,6 +13,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+UNIFORM = 1.0 / (4.0 * math.pi)  # density per steradian of `uniform_sphere`
+
 
 def mix32(v: Any) -> Any:
     """A bijective hash of 32-bit integers with low bias (constants found by C. Wellons's search, 2018)."""

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from disco_twin.light.sampling import Rng
-from disco_twin.light.tables import Opaque, Tables, cell_index
+from disco_twin.light.tables import Opaque, Tables, surroundings
 
 CAPACITY = 24  # states that wait; a photon that finds the stack full is not split
 MOST_COPIES = 8  # of one split
@@ -46,8 +46,8 @@ def target_at(window: Window, tag: Any, p: Any) -> Any:
 
 @dataclass
 class Stack:
-    """States that wait: a block of floats each (place, flight, last collision and its phase density, power), and how
-    many copies of each are still to be walked. Loop state, unlike the tables: Dr.Jit follows what is written to it.
+    """States that wait: a block of floats each (see `state_size`), and how many copies of each are still to be walked.
+    Loop state, unlike the tables: Dr.Jit follows what is written to it.
     """
 
     numbers: Any
@@ -55,21 +55,28 @@ class Stack:
     depth: Any
 
 
-def new_stack(lasers: int, lanes: int) -> Stack:
+def state_size(t: Tables, connects: bool) -> int:
+    """Floats of a state: place, direction, power; for connections to cameras the last collision and phase density."""
+    return 6 + t.lasers + (4 if connects else 0)
+
+
+def new_stack(t: Tables, connects: bool, lanes: int) -> Stack:
     """An empty stack for each lane."""
-    numbers, copies = dr.alloc_local(mi.Float, CAPACITY * (10 + lasers)), dr.alloc_local(mi.UInt32, CAPACITY)
+    numbers, copies = dr.alloc_local(mi.Float, CAPACITY * state_size(t, connects)), dr.alloc_local(mi.UInt32, CAPACITY)
     return Stack(numbers, copies, dr.zeros(mi.UInt32, lanes))
 
 
 @dr.syntax
-def resume(t: Tables, stack: Stack, photon: Any, running: Any, weight: Any) -> Any:
+def resume(t: Tables, stack: Stack, photon: Any, running: Any, weight: Any, connects: bool) -> Any:
     """Lanes without a photon take a copy that waits. Returns (photon, stack)."""
     if dr.hint(running & ~photon.alive & (stack.depth > 0)):
-        top, size = stack.depth - 1, 10 + t.lasers
+        top, size = stack.depth - 1, state_size(t, connects)
         v = [stack.numbers.read(top * size + k) for k in range(size)]
-        photon.p, photon.d, photon.last = mi.Point3f(*v[0:3]), mi.Vector3f(*v[3:6]), mi.Point3f(*v[6:9])
-        photon.phase, photon.in_reach, photon.w = dr.abs(v[9]), v[9] > 0.0, weight(*v[10:])
-        photon.empty = dr.gather(mi.Float, t.distance, cell_index(t, photon.p))
+        photon.p, photon.d, photon.w = mi.Point3f(*v[0:3]), mi.Vector3f(*v[3:6]), weight(*v[6 : 6 + t.lasers])
+        if dr.hint(connects, mode="scalar"):
+            photon.last = mi.Point3f(*v[-4:-1])
+            photon.phase, photon.in_reach = dr.abs(v[-1]), v[-1] > 0.0
+        photon.empty, photon.rate = surroundings(t, photon.p)
         photon.alive, photon.inside, photon.entered = mi.Bool(True), mi.Bool(True), mi.Bool(True)
         photon.clear, photon.steps = mi.Vector3f(0.0), mi.UInt32(0)
         left = stack.copies.read(top) - 1
@@ -81,7 +88,7 @@ def resume(t: Tables, stack: Stack, photon: Any, running: Any, weight: Any) -> A
 @dr.syntax
 def weigh(
     t: Tables, window: Any, stack: Any, photon: Any, first_tag: Any, inverse_scale: Any, sums: Any,
-    rng: Rng,
+    rng: Rng, connects: bool,
 ) -> Any:  # fmt: skip
     """Bring the photon's power (the strongest wavelength's) to within a factor of two of the target where it is.
 
@@ -104,9 +111,10 @@ def weigh(
                 count = mi.UInt32(dr.minimum(ratio, MOST_COPIES))
                 photon.w /= mi.Float(count)
                 phase = dr.select(photon.in_reach, photon.phase, -photon.phase)
-                values = [*photon.p, *photon.d, *photon.last, phase, *[photon.w[k] for k in range(t.lasers)]]
-                for k in range(10 + t.lasers):
-                    stack.numbers.write(values[k], stack.depth * (10 + t.lasers) + k)
+                values = [*photon.p, *photon.d, *[photon.w[k] for k in range(t.lasers)], *photon.last, phase]
+                size = state_size(t, connects)
+                for k in range(size):
+                    stack.numbers.write(values[k], stack.depth * size + k)
                 stack.copies.write(count - 1, stack.depth)
                 stack.depth += 1
     return photon, stack, sums, rng

@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from disco_twin.light.sampling import Rng
+from disco_twin.light.sampling import Rng, exponential
 
 FAR = 1e30
 
@@ -32,13 +32,15 @@ class Tables(Opaque):
     homogeneous: bool
     isotropic: bool
     g: Any
-    majorant: Any
+    majorant: Any  # 1/mm, of the whole object
+    local: bool  # whether `distance` holds a local majorant beside each distance
+    stretch: Any  # mm along each axis for which a local majorant holds
     medium: Any  # Float, per voxel (sigma_t / majorant, albedo...), padded to 2 or 4 channels
     albedo: Any  # weight type, the homogeneous medium's
     dims: Any
     medium_low: Any
     medium_scale: Any
-    distance: Any
+    distance: Any  # Float, per cell: distance, or (distance, local majorant)
     normal: Any
     cells: int
     low: Any
@@ -97,6 +99,35 @@ def cell_index(t: Tables, q: Any) -> Any:
     cell = mi.Point3i(dr.floor((q - t.low) * t.inverse_cell))
     cell = dr.minimum(dr.maximum(cell, 0), t.cells - 1)
     return mi.UInt32((cell.z * t.cells + cell.y) * t.cells + cell.x)
+
+
+def surroundings(t: Tables, q: Any) -> tuple[Any, Any]:
+    """Radius of a ball about q that holds no surface (none if <= 0), and the majorant for a flight from q."""
+    grid = (q - t.low) * t.inverse_cell
+    cell = dr.floor(grid)
+    off_centre = dr.norm(grid - cell - 0.5) / t.inverse_cell
+    whole = dr.minimum(dr.maximum(mi.Point3i(cell), 0), t.cells - 1)
+    index = mi.UInt32((whole.z * t.cells + whole.y) * t.cells + whole.x)
+    if t.local:
+        found = dr.gather(mi.Vector2f, t.distance, index)
+        return found[0] - off_centre, found[1]
+    return dr.gather(mi.Float, t.distance, index) - off_centre, mi.Float(t.majorant)
+
+
+def near_surface(t: Tables, empty: Any) -> Any:
+    """Whether collisions with `empty` mm around them send lobe connections."""
+    return mi.Bool(True) if t.matched else empty < t.reach
+
+
+def free_flight(t: Tables, direction: Any, rate: Any, rng: Rng) -> tuple[Any, Any]:
+    """Length of a flight under the majorant `rate`, and the rate to test the collision at its end against: infinite,
+    for no collision, where the flight ends because the majorant holds no farther.
+    """
+    flight = exponential(rng) / rate
+    if not t.local:
+        return flight, mi.Float(rate)
+    longest = t.stretch / dr.max(dr.abs(direction))
+    return dr.minimum(flight, longest), dr.select(flight < longest, rate, dr.inf)
 
 
 def medium_at(t: Tables, q: Any, rng: Rng) -> tuple[Any, Any]:

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from disco_twin.light import tables as kernel
 from disco_twin.light.balance import EnergyBalance
-from disco_twin.light.distance import build_distance_field
+from disco_twin.light.distance import DistanceField, build_distance_field
 from disco_twin.light.importance import Diffusion, Splitting, diffusion, window_targets
+from disco_twin.light.majorants import LocalMajorants, local_majorants
 from disco_twin.light.sources import Source, opaque3, to_float, weight_type
 from disco_twin.light.splitting import Window
+from disco_twin.light.tables import FAR
 from disco_twin.light.walk import Balance, walk
 from disco_twin.object.build import Medium, TwinObject
 from pipeline.calibrate.camera import PinholeCamera
@@ -62,10 +64,11 @@ class Traced:
 class Transport:
     """The object as the walk sees it: Mitsuba scene, distance field, medium tables, one group of wavelengths a walk.
 
-    Wavelengths with the same sigma_t and g share one walk; the others get walks of their own (`groups`).
+    Wavelengths with the same sigma_t and g share one walk; the others get walks of their own (`groups`). local=False:
+    one majorant for the whole object, which costs time; benchmarks and tests compare with it.
     """
 
-    def __init__(self, obj: TwinObject, cells: int = 128, lobe: Lobe | None = None) -> None:
+    def __init__(self, obj: TwinObject, cells: int = 128, lobe: Lobe | None = None, local: bool = True) -> None:
         self.object = obj
         self.lobe = lobe or Lobe.of(obj.medium, obj.boundary.alpha)
         self.vertices = np.asarray(obj.mesh.vertices, np.float64)
@@ -82,19 +85,31 @@ class Transport:
             "matched": {"type": "null"},
         }  # fmt: skip
         self.scene = mesh_scene(self.vertices, self.faces, bsdfs[obj.boundary.kind])
-        self._cells = cells
+        self._cells, self._local = cells, local
         self._diffusion: dict[int, Diffusion] = {}
+        self._tables_of: dict[tuple[int, ...], kernel.Tables] = {}
+
+    @cached_property
+    def _field(self) -> DistanceField:
+        return build_distance_field(self.object.mesh, self._cells)
+
+    @cached_property
+    def _inside(self) -> NDArray[np.int64]:
+        """(N, 3) indices [z, y, x] of cells of the distance field that lie in the object: every fourth per axis."""
+        field = self._field
+        index = np.stack(np.meshgrid(*[np.arange(2, field.cells, 4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        centres = field.low + (index[:, ::-1] + 0.5) * field.cell
+        return index[np.asarray(self.object.mesh.contains(centres))]
 
     @cached_property
     def _shared(self) -> dict[str, Any]:
         """Tables that do not depend on the wavelength."""
-        field = build_distance_field(self.object.mesh, self._cells)
+        field = self._field
         return dict(
             scene=self.scene,
             bsdf=self.scene.shapes()[0].bsdf(),
             matched=self.object.boundary.kind == "matched",
             eta=self.object.boundary.eta,
-            distance=to_float(field.distance),
             normal=to_float(field.normal),
             cells=field.cells,
             low=opaque3(mi.Point3f, field.low),
@@ -110,6 +125,11 @@ class Transport:
             lift=dr.opaque(mi.Float, 4e-6 * (1.0 + float(np.abs(self.vertices).max()))),
         )
 
+    def _local_majorants(self, sigma_t: F64) -> LocalMajorants | None:
+        medium, field = self.object.medium, self._field
+        low, high = np.asarray(medium.low, float), np.asarray(medium.high, float)
+        return local_majorants(sigma_t, low, high, field.low, field.cell, field.cells, self._inside)
+
     def _tables(self, group: Sequence[int]) -> kernel.Tables:
         medium = self.object.medium
         sigma_t = medium.sigma_t[group[0]].astype(np.float64)
@@ -121,6 +141,8 @@ class Transport:
         packed[..., 0] = sigma_t / majorant
         packed[..., 1 : 1 + len(group)] = np.moveaxis(albedo, 0, -1)
         size = np.asarray(medium.high) - np.asarray(medium.low)
+        local = self._local_majorants(sigma_t) if self._local and not homogeneous else None
+        field = self._field.distance if local is None else np.stack([self._field.distance, local.rate], axis=-1)
         nz, ny, nx = sigma_t.shape
         g = float(medium.g[group[0]])
         return kernel.Tables(
@@ -130,6 +152,9 @@ class Transport:
             isotropic=g == 0.0,
             g=dr.opaque(mi.Float, g),
             majorant=dr.opaque(mi.Float, majorant),
+            local=local is not None,
+            stretch=dr.opaque(mi.Float, local.stretch if local is not None else FAR),
+            distance=to_float(field),
             medium=to_float(packed),
             albedo=weight_type(len(group))(*[dr.opaque(mi.Float, float(a.flat[0])) for a in albedo]),
             dims=mi.ScalarPoint3i(nx, ny, nz),
@@ -198,11 +223,13 @@ class Transport:
         return Traced(join("images", 3), join("variance", 3), join("deposits", 1), balance)
 
     def _trace_group(
-        self, source: Source, group: Sequence[int], tags: int, walks: int, seed: int, streams: NDArray[np.uint32],
+        self, source: Source, group: tuple[int, ...], tags: int, walks: int, seed: int, streams: NDArray[np.uint32],
         cameras: Sequence[PinholeCamera], layers: int, deposit: bool, first: int, lanes: int,
         split: Splitting | None,
     ) -> Traced:  # fmt: skip
-        tables = self._tables(group)
+        if group not in self._tables_of:
+            self._tables_of[group] = self._tables(group)
+        tables = self._tables_of[group]
         table = camera_table(cameras) if cameras else None
         per_tag = (
             8

@@ -21,7 +21,6 @@ Not supported: emission, polarisation, an index that varies inside, wavelength c
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,7 +32,17 @@ from disco_twin.light.connect import connect_exit, connect_lobes
 from disco_twin.light.sampling import Rng
 from disco_twin.light.sources import Source, weight_type
 from disco_twin.light.splitting import Window, new_stack, resume, weigh
-from disco_twin.light.tables import FAR, Cameras, Deposits, Images, Tables, cell_index, medium_at
+from disco_twin.light.tables import (
+    FAR,
+    Cameras,
+    Deposits,
+    Images,
+    Tables,
+    free_flight,
+    medium_at,
+    near_surface,
+    surroundings,
+)
 
 INNER = 8  # collisions per outer step
 MAX_STEPS = 1 << 18  # outer steps after which a photon is counted as still inside
@@ -80,6 +89,7 @@ class Photon:
     entered: Any  # has ever been
     alive: Any
     empty: Any  # radius of a ball about p that holds no surface
+    rate: Any  # majorant at p, 1/mm
     clear: Any  # lifts the origin of the next intersection test off the surface just left
     # The last collision, for the balance heuristic: place, whether near the surface, phase density of the flight.
     last: Any
@@ -105,24 +115,24 @@ def nobody(weight: Any, lanes: int) -> tuple[Photon, Reservoir]:
     down.z = -1.0
     photon = Photon(
         mi.Point3f(point), down, weight(power), mi.UInt32(integer), mi.UInt32(integer), mi.Bool(flag), mi.Bool(flag),
-        mi.Bool(flag), mi.Float(number), mi.Vector3f(vector), mi.Point3f(point), mi.Bool(flag), mi.Float(number),
+        mi.Bool(flag), mi.Float(number), mi.Float(number + 1.0), mi.Vector3f(vector), mi.Point3f(point), mi.Bool(flag),
+        mi.Float(number),
     )  # fmt: skip
     return photon, Reservoir(mi.Float(number), mi.Point3f(point), mi.Vector3f(vector), weight(power))
 
 
 @dr.syntax
-def collide(t: Tables, photon: Photon, reservoir: Reservoir, sums: Balance, rng: Rng, connects: bool) -> Any:
-    """A possible collision at the photon's place: absorb, offer it to the reservoir, scatter; or nothing (null).
+def collide(t: Tables, photon: Photon, rate: Any, reservoir: Reservoir, sums: Balance, rng: Rng, connects: bool) -> Any:
+    """A possible collision at the photon's place, after a flight under the majorant `rate`: absorb, offer it to the
+    reservoir, scatter; or nothing (null).
 
     Returns (photon, reservoir, sums, rng): Dr.Jit's branches replace the objects that they change.
     """
     chance, albedo = medium_at(t, photon.p, rng)
-    if dr.hint(rng.next() < chance):
+    if dr.hint(rng.next() * rate < chance * t.majorant):
         sums.absorbed += type(sums.absorbed)(photon.w * (1.0 - albedo))
         photon.w *= albedo
-        near = mi.Bool(True)
-        if dr.hint(not t.matched, mode="scalar"):
-            near = photon.empty < t.reach
+        near = near_surface(t, photon.empty)
         if dr.hint(connects, mode="scalar"):
             reservoir.seen = dr.select(near, reservoir.seen + 1.0, reservoir.seen)
             take = near & (rng.next() * reservoir.seen < 1.0)
@@ -130,7 +140,7 @@ def collide(t: Tables, photon: Photon, reservoir: Reservoir, sums: Balance, rng:
             reservoir.before = dr.select(take, photon.d, reservoir.before)
             reservoir.weight = dr.select(take, photon.w, reservoir.weight)
         scattered = sampling.uniform_sphere(rng)
-        photon.phase = mi.Float(1.0 / (4.0 * math.pi))
+        photon.phase = mi.Float(sampling.UNIFORM)
         if dr.hint(not t.isotropic, mode="scalar"):
             scattered = sampling.henyey_greenstein(rng, photon.d, t.g)
             photon.phase = sampling.henyey_greenstein_pdf(dr.dot(photon.d, scattered), t.g)
@@ -178,14 +188,15 @@ def cross(
     photon.in_reach = mi.Bool(False)
     photon.p = mi.Point3f(si.p)
     photon.clear = mi.Vector3f(si.n * dr.select(photon.inside, -t.lift, t.lift))
+    _, photon.rate = surroundings(t, photon.p)
     photon.empty = mi.Float(0.0)
     return photon, sums, rng
 
 
 @dr.syntax
 def fly(
-    t: Tables, photon: Photon, flight: Any, reservoir: Reservoir, cams: Cameras | None, images: Images | None,
-    deposits: Deposits | None, sums: Balance, rng: Rng,
+    t: Tables, photon: Photon, flight: Any, rate: Any, reservoir: Reservoir, cams: Cameras | None,
+    images: Images | None, deposits: Deposits | None, sums: Balance, rng: Rng,
 ) -> Any:  # fmt: skip
     """A flight that may meet the surface: up to it, to the collision at its end, or out of sight.
 
@@ -203,12 +214,12 @@ def fly(
     else:
         if dr.hint(photon.inside):
             photon.p = mi.Point3f(dr.fma(photon.d, flight, photon.p))
-            photon.empty = dr.gather(mi.Float, t.distance, cell_index(t, photon.p))
+            photon.empty, photon.rate = surroundings(t, photon.p)
             leaked = dr.max(dr.abs(photon.p)) > t.bound  # only through a mesh that is not watertight
             sums.inside += wide(dr.select(leaked, photon.w, 0.0))
             photon.alive = ~leaked
             if dr.hint(~leaked):
-                photon, reservoir, sums, rng = collide(t, photon, reservoir, sums, rng, cams is not None)
+                photon, reservoir, sums, rng = collide(t, photon, rate, reservoir, sums, rng, cams is not None)
         else:
             sums.reflected += wide(dr.select(photon.entered, 0.0, photon.w))
             sums.escaped += wide(dr.select(photon.entered, photon.w, 0.0))
@@ -238,14 +249,14 @@ def walk(
     dr.eval(counter)
     rng = Rng(dr.zeros(mi.UInt32, lanes), dr.zeros(mi.UInt32, lanes))
     photon, reservoir = nobody(weight, lanes)
-    flight = dr.zeros(mi.Float, lanes)
+    flight, rate = dr.zeros(mi.Float, lanes), dr.ones(mi.Float, lanes)
     running = dr.full(mi.Bool, True, lanes)
-    stack = new_stack(t.lasers, lanes) if window is not None else None
+    stack = new_stack(t, cams is not None, lanes) if window is not None else None
 
     while dr.hint(running, label="walk"):
         # 1. A lane without a photon takes a copy that waits, or fetches the next one.
         if dr.hint(window is not None, mode="scalar"):
-            photon, stack = resume(t, stack, photon, running, weight)
+            photon, stack = resume(t, stack, photon, running, weight, cams is not None)
         need = running & ~photon.alive
         if dr.hint(need):
             index = dr.scatter_inc(counter, mi.UInt32(0), need)
@@ -263,18 +274,19 @@ def walk(
         pending = photon.alive & ~photon.inside
         while dr.hint((k < INNER) & photon.alive & ~pending, label="collisions"):
             k += 1
-            flight = sampling.exponential(rng) / t.majorant
+            flight, rate = free_flight(t, photon.d, photon.rate, rng)
             q = mi.Point3f(dr.fma(photon.d, flight, photon.p))
-            ball = dr.gather(mi.Float, t.distance, cell_index(t, q))
+            ball, there = surroundings(t, q)
             pending = flight >= photon.empty + ball
             if dr.hint(~pending):
                 # Copies: two names of one object would be merged as one when Dr.Jit joins the branches.
-                photon.p, photon.empty, photon.clear = mi.Point3f(q), mi.Float(ball), mi.Vector3f(0.0)
-                photon, reservoir, sums, rng = collide(t, photon, reservoir, sums, rng, cams is not None)
+                photon.p, photon.empty, photon.rate = mi.Point3f(q), mi.Float(ball), mi.Float(there)
+                photon.clear = mi.Vector3f(0.0)
+                photon, reservoir, sums, rng = collide(t, photon, rate, reservoir, sums, rng, cams is not None)
 
         # 3. The surface, or a collision that the distance field could not vouch for.
         if dr.hint(photon.alive & pending):
-            photon, reservoir, sums, rng = fly(t, photon, flight, reservoir, cams, images, deposits, sums, rng)
+            photon, reservoir, sums, rng = fly(t, photon, flight, rate, reservoir, cams, images, deposits, sums, rng)
 
         # 4. One drawn collision connects to the cameras, also of a photon that has just left.
         if dr.hint(cams is not None, mode="scalar"):
@@ -284,5 +296,7 @@ def walk(
                 reservoir.seen = mi.Float(0.0)
 
         # 5. The weight window: Russian roulette, splitting.
-        photon, stack, sums, rng = weigh(t, window, stack, photon, first_tag, inverse_scale, sums, rng)
+        photon, stack, sums, rng = weigh(
+            t, window, stack, photon, first_tag, inverse_scale, sums, rng, cams is not None
+        )
     return sums

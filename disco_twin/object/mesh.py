@@ -92,6 +92,13 @@ def closest(mesh: trimesh.Trimesh, points: F64) -> tuple[F64, NDArray[np.int64]]
     return np.einsum("nk,nkd->nd", weights, v[f[triangle]]), triangle.astype(np.int64)
 
 
+def distance_to(mesh: trimesh.Trimesh, points: F64) -> F64:
+    """(N,) unsigned distance to the surface of (N, 3) points."""
+    v, f = _arrays(mesh)
+    squared: F64 = np.asarray(gpytoolbox.squared_distance(points, v, f, use_cpp=True)[0], float)
+    return np.asarray(np.sqrt(squared))
+
+
 def depth(mesh: trimesh.Trimesh, points: F64) -> F64:
     """(N,) distance to the surface of (N, 3) points, positive inside."""
     v, f = _arrays(mesh)

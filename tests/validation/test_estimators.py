@@ -1,10 +1,9 @@
-"""The estimators behind an image: connections, transmittance, projection, variance and the distance field."""
+"""The estimators behind an image: connections, transmittance, projection, variance."""
 
 from __future__ import annotations
 
 import math
 
-import gpytoolbox
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -16,12 +15,9 @@ from twins import beam, block, camera, pixel_areas, twin
 
 from disco_twin.light import connect
 from disco_twin.light.connect import project, transmittance
-from disco_twin.light.distance import build_distance_field, sample_surface
 from disco_twin.light.tables import medium_at
 from disco_twin.light.transport import Lobe, Transport, camera_table
-from disco_twin.object import shapes
 from disco_twin.object.build import Boundary, Medium, TwinObject
-from disco_twin.object.schema import Pebble
 from pipeline.calibrate.camera import PinholeCamera, look_at
 
 F64 = NDArray[np.float64]
@@ -63,7 +59,9 @@ def test_lobe_connection_is_unbiased(g: float, alpha: float) -> None:
     obj = bumpy(alpha=alpha, g=g)
     views = [camera(place, 13.0, 24) for place in VIEWS]
     images = []
-    for lobe, walks in ((None, 2_000), (Lobe(100.0, 0.0, 0.0), 12_000)):
+    # The smoother, the rarer and the brighter the exits towards a camera, and the later their sums are normal.
+    few, many = (2_000, 12_000) if alpha > 0.1 else (4_000, 80_000)
+    for lobe, walks in ((None, few), (Lobe(100.0, 0.0, 0.0), many)):
         transport = Transport(obj, cells=64, lobe=lobe)
         traced = transport.trace(beam(REPLICATES, **SPOT), REPLICATES, walks, seed=71, cameras=views, layers=2)
         assert traced.images is not None
@@ -75,7 +73,7 @@ def test_lobe_connection_is_unbiased(g: float, alpha: float) -> None:
     assert_z(z_of_difference(cut[0][:, busy], cut[1][:, busy]), f"blocks, g = {g}, alpha = {alpha}")
     total = [i.sum(axis=(-1, -2)) for i in images]
     assert_z(z_of_difference(*total), f"layers and cameras, g = {g}, alpha = {alpha}")
-    per_walk = [t[:, 0].var(axis=0, ddof=1) * n for t, n in zip(total, (2_000, 12_000), strict=True)]
+    per_walk = [t[:, 0].var(axis=0, ddof=1) * n for t, n in zip(total, (few, many), strict=True)]
     assert np.all(per_walk[0] < per_walk[1] / 2)
 
 
@@ -240,55 +238,3 @@ def test_projection_is_the_cameras() -> None:
     # Pixels per square millimetre across the line of sight.
     exact = np.abs(da[:, 0] * db[:, 1] - da[:, 1] * db[:, 0]) / (2 * step) ** 2
     assert np.abs(np.array(factor)[used] / exact[used] - 1).max() < 1e-3
-
-
-SURFACES = {
-    "pebble": lambda: shapes.pebble(Pebble(kind="pebble")),
-    "plate": lambda: trimesh.creation.box(extents=[30.0, 20.0, 0.05]),
-    "torus": lambda: trimesh.creation.torus(5.0, 2.0, major_sections=48, minor_sections=24),
-    "soup": lambda: trimesh.Trimesh(
-        np.random.default_rng(8).normal(size=(90, 3)) * [9.0, 3.0, 1.0], np.arange(90).reshape(30, 3), process=False
-    ),
-}
-
-
-@pytest.mark.parametrize("surface", sorted(SURFACES))
-def test_distance_field_is_a_lower_bound(surface: str) -> None:
-    """Rationale: a flight is not tested against the surface if the field vouches for it; one cell that claims too much
-    lets light through walls.
-
-    Expected behaviour: at points anywhere, next to the surface, and outside the grid, the field's value is at most the
-    exact distance, and at least that less four cells (or zero), so it is of use.
-    """
-    mesh = SURFACES[surface]()
-    field = build_distance_field(mesh, 64)
-    random = np.random.default_rng(9)
-    low, high = np.asarray(mesh.bounds, float)
-    reach = field.cell * field.cells / 2
-    everywhere = (low + high) / 2 + random.uniform(-1.1 * reach, 1.1 * reach, (20_000, 3))
-    samples, _ = sample_surface(mesh, 4 * field.cell)
-    pick = random.integers(len(samples), size=20_000)
-    beside = samples[pick] + random.normal(size=(20_000, 3)) * random.choice([0.01, 0.5, 2.0], (20_000, 1)) * field.cell
-    points = np.concatenate([everywhere, beside])
-    corners, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32)
-    exact = np.sqrt(gpytoolbox.squared_distance(points, corners, faces, use_cpp=True)[0])
-    index = np.clip(np.floor((points - field.low) / field.cell).astype(int), 0, field.cells - 1)
-    value = field.distance[index[:, 2], index[:, 1], index[:, 0]].astype(float)
-    assert np.all(value <= exact + 1e-6 * field.cell), f"{np.max(value - exact):.3g} mm too much"
-    covered = (np.abs(points - (low + high) / 2) < reach - field.cell).all(axis=1)
-    assert np.all(value[covered] >= exact[covered] - 4 * field.cell)
-
-
-@pytest.mark.parametrize("surface", ["torus", "soup"])
-def test_surface_samples_leave_no_gap(surface: str) -> None:
-    """No point of the surface is farther than the spacing from a sample of its own face."""
-    mesh = SURFACES[surface]()
-    spacing = 0.4
-    samples, faces = sample_surface(mesh, spacing)
-    random = np.random.default_rng(10)
-    for face in random.integers(len(mesh.faces), size=60):
-        b = random.dirichlet([1.0, 1.0, 1.0], 200)
-        points = b @ np.asarray(mesh.triangles[face], float)
-        own = samples[faces == face]
-        nearest = np.linalg.norm(points[:, None] - own[None], axis=2).min(axis=1)
-        assert nearest.max() <= spacing
