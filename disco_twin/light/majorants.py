@@ -54,8 +54,10 @@ def local_majorants(
     sigma_t: F64, medium_low: F64, medium_high: F64, low: F64, cell: float, cells: int, inside: NDArray[np.int64]
 ) -> LocalMajorants | None:
     """The majorants whose stretch asks for the fewest flights in the cells `inside`, (N, 3) indices [z, y, x]; None
-    where one for all does nearly as well.
+    where one for all does nearly as well, or where the object is thinner than the cells.
     """
+    if not len(inside):
+        return None
     highest = max(float(sigma_t.max()), 1e-9)
     within = greatest_in_cells(sigma_t, medium_low, medium_high, low, cell, cells)
     best: LocalMajorants | None = None

@@ -165,3 +165,6 @@ def test_local_majorants_are_left_out_where_they_save_nothing() -> None:
     dense = np.ones((8, 8, 8))
     inside = np.argwhere(np.ones((16, 16, 16), bool))
     assert local_majorants(dense, np.zeros(3), np.full(3, 8.0), np.zeros(3), 0.5, 16, inside) is None
+    dense[0] = 9.0
+    assert local_majorants(dense, np.zeros(3), np.full(3, 8.0), np.zeros(3), 0.5, 16, inside) is not None
+    assert local_majorants(dense, np.zeros(3), np.full(3, 8.0), np.zeros(3), 0.5, 16, inside[:0]) is None
