@@ -136,20 +136,44 @@ def footprint_reading(mesh: trimesh.Trimesh, camera: PinholeCamera, eta: float, 
     return Reading(operator, share, cosine / area.clip(1e-12))
 
 
+@dataclass(frozen=True)
+class ImagePoints:
+    """Where N points of the surface lie in a view's image. pixel: (N, 2) x, y; cosine: (N,) with the direction to the
+    camera; visible: (N,) whether the camera sees them: in the image, facing it, nothing in between
+    """
+
+    pixel: F64
+    cosine: F64
+    visible: NDArray[np.bool_]
+
+
+def image_points(mesh: trimesh.Trimesh, camera: PinholeCamera, points: F64, normals: F64, lift: F64) -> ImagePoints:
+    """(N, 3) points of the mesh in mm with (N, 3) unit normals, be they vertices or an atlas's texels.
+
+    lift: (N,) mm along the normal from where the camera is looked for, lest a point hide itself
+    """
+    pixel, _ = camera.project(points)
+    to_camera = camera.position - points
+    to_camera /= np.linalg.norm(to_camera, axis=1)[:, None]
+    cosine = np.einsum("ni,ni->n", normals, to_camera)
+    inside = ((pixel >= 0.5) & (pixel <= np.array([camera.width, camera.height]) - 0.5)).all(axis=1)
+    visible = inside & (cosine > 0)
+    some = np.flatnonzero(visible)
+    lifted = points[some] + lift[some, None] * normals[some]
+    visible[some] = first_hit(mesh, lifted, to_camera[some]).triangle < 0
+    return ImagePoints(pixel, cosine, visible)
+
+
 def bilinear_reading(mesh: trimesh.Trimesh, camera: PinholeCamera, eta: float, max_view_deg: float) -> Reading:
     """Each vertex by one bilinear look-up at its projection (thesis 5.3.1)."""
     vertices, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
-    position, _ = camera.project(vertices)
-    to_camera = camera.position - vertices
-    distance = np.linalg.norm(to_camera, axis=1)
-    to_camera /= distance[:, None]
-    cosine = (normals * to_camera).sum(axis=1)
-    lift = 1e-3 * np.sqrt(vertex_areas(mesh))[:, None]
-    blocked = first_hit(mesh, vertices + lift * normals, to_camera).triangle >= 0
-    corner = np.floor(position - 0.5).astype(np.int64)
-    fraction = position - 0.5 - corner
-    inside = ((corner >= 0) & (corner + 1 < [camera.width, camera.height])).all(axis=1)
-    seen = np.flatnonzero(inside & ~blocked & (cosine > np.cos(np.deg2rad(max_view_deg))))
+    found = image_points(mesh, camera, vertices, normals, 1e-3 * np.sqrt(vertex_areas(mesh)))
+    cosine = found.cosine
+    seen = np.flatnonzero(found.visible & (cosine > np.cos(np.deg2rad(max_view_deg))))
+    corner = np.zeros((len(vertices), 2), np.int64)
+    last = [camera.width - 2, camera.height - 2]
+    corner[seen] = np.minimum(np.floor(found.pixel[seen] - 0.5).astype(np.int64), last)
+    fraction = found.pixel - 0.5 - corner
     x, y = corner[seen].T
     fx, fy = fraction[seen].T
     pixel = np.concatenate([(y + j) * camera.width + x + i for j in (0, 1) for i in (0, 1)])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -11,7 +13,7 @@ from pipeline.reconstruct.distances import hat_points, spot_pairs, vertex_pairs
 from pipeline.reconstruct.harmonics import harmonics
 from pipeline.reconstruct.mesh import first_hit, stiffness, vertex_areas
 from pipeline.reconstruct.spots import Spots
-from pipeline.reconstruct.views import footprint_reading, see_surface
+from pipeline.reconstruct.views import bilinear_reading, footprint_reading, image_points, see_surface
 from pipeline.rig import CameraConfig
 
 
@@ -164,3 +166,36 @@ def test_nothing_is_read_across_an_edge_of_depth() -> None:
     assert rim.sum() > 20
     assert not np.isin(np.flatnonzero(rim), read).any()
     assert np.isin(np.flatnonzero(off_axis < 0.5 * 5.0 / 170.0), read).all()
+
+
+def test_points_of_the_surface_are_found_in_the_image_where_nothing_hides_them() -> None:
+    """Rationale: a small sphere before a large one hides a disc of it, whose rim is known; texels are any points.
+
+    Expected behaviour: pixels are the projections; visible are the near sides but for that disc, and nothing else.
+    """
+    near = trimesh.creation.icosphere(subdivisions=4, radius=5.0).apply_translation((0.0, -30.0, 0.0))
+    scan = trimesh.util.concatenate([trimesh.creation.icosphere(subdivisions=4, radius=15.0), near])
+    camera = wide_camera((0.0, -200.0, 0.0), 38.0)
+    points, face = trimesh.sample.sample_surface(scan, 4000, seed=1)
+    normals = scan.face_normals[face]
+    found = image_points(scan, camera, points, normals, np.full(len(points), 1e-3))
+    np.testing.assert_allclose(found.pixel, camera.project(points)[0])
+    towards = camera.position - points
+    facing = (normals * towards).sum(axis=1) > 0
+    way = -towards / np.linalg.norm(towards, axis=1)[:, None]
+    to_near = np.array([0.0, -30.0, 0.0]) - camera.position
+    beside = np.linalg.norm(to_near - (way @ to_near)[:, None] * way, axis=1)  # of the small sphere's centre
+    large = np.linalg.norm(points, axis=1) < 16.0
+    expected = facing & ~(large & (beside < 5.0))
+    clear = (np.abs(beside - 5.0) > 0.1) | ~large  # its facets lie within its radius
+    assert (found.visible == expected)[clear].all()
+    assert (facing & ~found.visible & large).sum() > 50
+    assert found.cosine[found.visible].min() > 0
+    aside = image_points(
+        scan, replace(camera, centre=camera.centre + 48.0), points, normals, np.full(len(points), 1e-3)
+    )
+    assert 0 < aside.visible.sum() < found.visible.sum()  # the others lie outside the picture
+    hidden = np.flatnonzero(facing & ~found.visible & large & clear)
+    reading = bilinear_reading(scan, camera, 1.3, 80.0)
+    vertex = np.argmin(np.linalg.norm(scan.vertices - points[hidden[0]], axis=1))
+    assert reading.share[vertex] == 0.0
