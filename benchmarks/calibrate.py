@@ -1,6 +1,7 @@
 """Error against time of the estimators of a calibration, each on images whose truth is known.
 
-Intrinsics by the number of boards, poses by the number of refining steps (and the thesis's XOR search, by its number of
+The response of a curved camera by the pixels looked at (and OpenCV's, after Debevec and Malik, which sees eight bits),
+intrinsics by the number of boards, poses by the number of refining steps (and the thesis's XOR search, by its number of
 evaluations), the projector by the number of spots. Boards and silhouettes are ray-cast, without the renderer.
 """
 
@@ -12,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -20,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from disco_twin.camera.lars3 import Lars3, lars3_sensor
+from disco_twin.camera.sensor import gamma_curve
 from disco_twin.camera.targets import TargetSource
 from disco_twin.deviation import actual_rig
 from disco_twin.object.schema import Pebble
@@ -31,7 +34,8 @@ from pipeline.calibrate.intrinsics import find_corners, fit_intrinsics
 from pipeline.calibrate.outline import mesh_mask, object_mask
 from pipeline.calibrate.projector import TwoMirrorProjector
 from pipeline.calibrate.projector_fit import projection, refine
-from pipeline.capture.targets import make_targets
+from pipeline.calibrate.response import TABLE, fit_response
+from pipeline.capture.targets import make_bracket, make_targets
 from pipeline.rig import CameraConfig, FaultsConfig, ProjectorConfig, RigConfig
 
 F64 = NDArray[np.float64]
@@ -87,6 +91,41 @@ def intrinsics(rig: RigConfig, counts: Sequence[int], repetitions: int) -> list[
         settings = {"boards": count, "reprojection_px": found.reprojection_px}
         points.append(took | {"error": error, "settings": settings})
     return points
+
+
+def responses(
+    rig: RigConfig, strides: Sequence[int], repetitions: int
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Error: of the exposure that a digital number stands for, as a share, rms from a fiftieth of the range on.
+
+    OpenCV's scale is its own: it is set to agree on the whole.
+    """
+    rig = rig.model_copy(update={"sensor": rig.sensor.model_copy(update={"response": "curved"})})
+    actual, sensor = actual_rig(rig, SEED), lars3_sensor(rig)
+    targets, plan = make_bracket(rig, 0)
+    optics = Lars3.of(rig, actual.cameras[0])
+    board = TargetSource(targets, actual.cameras[0], actual, 1.0).silhouette(0, 0)
+    steps = range(len(plan.angles_rad))
+    images = [optics.expose(board, 0, np.random.default_rng(k), k).charge for k in steps]
+    seconds, knots = [2.0**-k for k in steps], np.linspace(0, 1, TABLE)[TABLE // 50 :]
+    dense = np.linspace(0, 1, 100_001)
+    truth = np.interp(knots, gamma_curve(dense), dense)
+    ours, theirs = [], []
+    for stride in strides:
+        some = [image[:, ::stride] for image in images]
+        found, took = timed(lambda some=some: fit_response(some, seconds, sensor), repetitions)  # type: ignore[misc]
+        off = found.exposure[TABLE // 50 :] / truth - 1
+        settings = {"pixels": some[0].size, "stated": float(np.median(found.error[5:-1] / found.exposure[5:-1]))}
+        ours.append(took | {"error": float(np.sqrt((off**2).mean())), "settings": settings})
+    stack = [np.repeat((i >> 4).astype(np.uint8)[:, :, None], 3, axis=2) for i in images]
+    numbers = knots * (sensor.saturation_dn - sensor.offset_dn) + sensor.offset_dn
+    for samples in (70, 200):
+        solver = cv2.createCalibrateDebevec(samples=samples, lambda_=20.0, random=False)
+        curve, took = timed(lambda s=solver: s.process(stack, np.asarray(seconds, np.float32)), repetitions)  # type: ignore[misc]
+        ratio = np.interp(numbers, 16.0 * np.arange(256) + 7.5, np.asarray(curve, np.float64)[:, 0, 0]) / truth
+        off = ratio / np.exp(np.log(ratio).mean()) - 1
+        theirs.append(took | {"error": float(np.sqrt((off**2).mean())), "settings": {"pixels": samples}})
+    return ours, theirs
 
 
 def silhouette(mesh: trimesh.Trimesh, camera: PinholeCamera) -> NDArray[np.float32]:
@@ -183,7 +222,10 @@ def run(quick: bool = False) -> dict[str, Any]:
     ours, theirs = poses(
         rig, mesh, (2, 3) if quick else (2, 3, 5, 8), (100,) if quick else (100, 300, 1000), repetitions
     )
+    response, debevec = responses(rig, (4,) if quick else (4, 2, 1), repetitions)
     curves = [
+        {"name": "response", "points": response},
+        {"name": "response, OpenCV", "points": debevec},
         {"name": "focal length", "points": intrinsics(rig, (8,) if quick else (6, 12, 24), repetitions)},
         {"name": "pose, edges", "points": ours},
         {"name": "pose, XOR", "points": theirs},

@@ -9,20 +9,26 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from calibrate_twin import faulty_rig
+from calibrate_twin import QUICK, faulty_rig
 from numpy.typing import NDArray
 
 from disco_twin.camera.lars3 import Lars3, lars3_sensor
 from disco_twin.camera.sensor import gamma_curve
 from disco_twin.camera.targets import TargetSource
 from disco_twin.deviation import actual_rig
+from disco_twin.folder import RunFolder
 from disco_twin.rig import BracketRig
+from disco_twin.scene import load_scene
+from disco_twin.simulate import take_targets
+from disco_twin.world import World
 from hw.errors import InputError
 from hw.record import Sensor, to_radiance
-from pipeline.calibrate.measure import measure_response
+from pipeline.calibrate.measure import has_targets, measure_response
 from pipeline.calibrate.response import TABLE, Response, fit_response
 from pipeline.capture.loop import capture
+from pipeline.capture.stream import StreamReader
 from pipeline.capture.targets import BRACKET, FOLDER, make_bracket
+from pipeline.run import calibrate
 
 F64 = NDArray[np.float64]
 
@@ -133,3 +139,28 @@ def test_a_curved_camera_of_the_twin_means_radiance_after_its_bracket(tmp_path: 
         assert abs(to_radiance(raw, sensor, 0).radiance.mean() / level - 1) > 0.1
         pull = (image.radiance - image.radiance.mean()) / np.sqrt(image.variance)
         assert 0.9 < pull.std() < 1.1
+
+
+def test_a_run_photographs_the_bracket_and_the_pipeline_asks_for_it(tmp_path: Path) -> None:
+    """Rationale: a scene with curved cameras, without any other fault. Expected: the twin takes the bracket beside its
+    targets, continues where it stopped, and the pipeline refuses to take such cameras for linear ones.
+    """
+    scene = load_scene(QUICK, faults=False)
+    cameras = tuple(
+        c.model_copy(update={"width": 48, "height": 31, "pixel_pitch_um": 176.0}) for c in scene.rig.cameras[:1]
+    )
+    sensor = scene.rig.sensor.model_copy(update={"response": "curved"})
+    rig = scene.rig.model_copy(update={"sensor": sensor, "cameras": cameras})
+    world, folder = World(scene.model_copy(update={"rig": rig})), RunFolder(tmp_path)
+    assert not has_targets(folder.capture, rig)
+    with pytest.raises(InputError, match=r"sensor\.response = .curved.*not linear.*Remedy"):
+        calibrate(folder.capture, rig, lars3_sensor(rig), world.scan, None)
+    stored = []
+    for _ in range(2):
+        take_targets(world, folder, lambda *_: None)
+        with StreamReader(folder.capture / FOLDER / rig.cameras[0].name / BRACKET) as stream:
+            assert stream.complete
+            assert [int(raw.exponent.min()) for raw in stream] == list(range(rig.sensor.steps))  # type: ignore[union-attr]
+            stored.append(stream.bytes_stored)
+    assert stored[0] == stored[1]
+    assert has_targets(folder.capture, rig)
