@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+
+from disco_twin.noise import walks_below_camera
 from disco_twin.world import World, left_out_by_the_twin
 from pipeline.capture.targets import make_targets
 from pipeline.resources import usable_cores
@@ -39,6 +42,15 @@ def predict(world: World) -> list[tuple[str, str]]:
         targets = sum(len(make_targets(scene.rig, c)[1]) for c in range(len(scene.rig.cameras)))
         lines.insert(2, ("calibration", f"{targets} images of chessboards and of a white plate"))
     lines += [(name, f"about {value / 60:.1f} minutes on {cores} cores") for name, value in seconds.items()]
+    needed = walks_below_camera(scene)
+    lines.append(
+        (
+            "noise",
+            f"of the simulation up to {math.sqrt(needed / work.walks_per_spot):.0f} times the camera's in a pixel with "
+            f"{work.walks_per_spot} walks a spot; {needed:.1e} bring it below the camera's in every pixel (within a "
+            "factor of two); the spots' variance is kept pixel by pixel",
+        )
+    )
     lines += [("left out", f"{item['what']}: {item['because']}") for item in left_out_by_the_twin(world)]
     return lines
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from disco_twin.folder import RunFolder, write_atomically
+from disco_twin.noise import measured_noise
 from disco_twin.scene import Scene
 from hw.errors import InputError
 from pipeline.capture.stream import StreamReader
@@ -48,6 +49,7 @@ def make_summary(
         "method": method,
         "stages": list(stages),
         "capture": capture_figures(folder.capture, len(scene.rig.lasers)),
+        "simulation_noise": measured_noise(scene, folder.twin / "responses"),
         "calibration": calibration,
         "relit": scores["relit"],
         "reflectance": {"log10_rmse_by_decade": own["measured"], "coverage_by_decade": own["coverage"]},

@@ -26,7 +26,7 @@ class Exposed(NamedTuple):
     charge: F64
 
 
-def photoelectrons(radiance: NDArray[np.float32], sensor: Sensor, laser: int) -> F64:
+def photoelectrons(radiance: NDArray[np.floating], sensor: Sensor, laser: int) -> F64:
     """W/(mm^2 sr) -> mean photoelectrons per second."""
     return radiance.astype(np.float64) * sensor.responsivity[laser]
 
@@ -54,6 +54,19 @@ def integrate(rate: F64, sensor: Sensor, rng: Generator) -> Exposed:
     on = (charge <= sensor.decision_e) & (exponent > 0)
     charge[on] += rng.poisson(mean[on])
     return Exposed(exponent - on, charge)
+
+
+def expected_variance(radiance: F64, sensor: Sensor, laser: int) -> F64:
+    """Variance that the camera adds to a radiance, same shape, in (W/(mm^2 sr))^2: photons, dark signal, read-out and
+    digits, at the exposure that `integrate` chooses in the mean.
+    """
+    rate = photoelectrons(radiance, sensor, laser) + sensor.dark_e_per_s
+    longest = rate * sensor.longest_exposure_s
+    with np.errstate(divide="ignore"):
+        halvings = np.ceil(np.log2(longest / max(sensor.decision_e, 1e-9))) - 1
+    time = np.ldexp(sensor.longest_exposure_s, -np.clip(halvings, 0, sensor.steps - 1).astype(int))
+    noise = rate * time + sensor.read_noise_e**2 + sensor.gain_e_per_dn**2 / 12
+    return np.asarray(noise / (time * sensor.responsivity[laser]) ** 2)
 
 
 def add_read_noise(exposed: Exposed, sensor: Sensor, rng: Generator) -> Exposed:

@@ -17,6 +17,7 @@ from disco_twin.light import connect
 from disco_twin.light.connect import project, transmittance
 from disco_twin.light.tables import medium_at
 from disco_twin.light.transport import Lobe, Transport, camera_table
+from disco_twin.noise import splat_share
 from disco_twin.object.build import Boundary, Medium, TwinObject
 from pipeline.calibrate.camera import PinholeCamera, look_at
 
@@ -238,3 +239,29 @@ def test_projection_is_the_cameras() -> None:
     # Pixels per square millimetre across the line of sight.
     exact = np.abs(da[:, 0] * db[:, 1] - da[:, 1] * db[:, 0]) / (2 * step) ** 2
     assert np.abs(np.array(factor)[used] / exact[used] - 1).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("kind", "alpha", "g"), [("rough", 0.3, 0.0), ("rough", 0.05, 0.0), ("rough", 0.25, 0.8), ("matched", 0.0, 0.4)]
+)
+def test_a_walk_adds_a_splat_of_known_radiance(kind: str, alpha: float, g: float) -> None:
+    """Rationale: `disco-twin plan` says from it how many walks a scene takes.
+
+    Expected behaviour: variance of a pixel x walks / mean, between replicates, is within a factor of two (three
+    where light scatters forward) of `splat_share`, in each of the three decades below the brightest pixel.
+    """
+    view = camera(VIEWS[0], 13.0, 48)
+    walks, replicates = 4_000, 64
+    transport = Transport(bumpy(kind, alpha=alpha, g=g), cells=64)
+    images = transport.trace(beam(replicates, **SPOT), replicates, walks, seed=73, cameras=[view]).images  # type: ignore[arg-type]
+    assert images is not None
+    found = images[:, 0, 0, 0].astype(float)
+    mean, variance = found.mean(axis=0), found.var(axis=0, ddof=1)
+    unit = float(view.focal.prod() / (view.position @ view.position))
+    within = 2.0 if g < 0.5 else 3.0
+    for decade in range(3):
+        part = (mean <= mean.max() * 10.0**-decade) & (mean > mean.max() * 10.0 ** -(decade + 1))
+        assert part.sum() >= 5
+        share = variance[part].sum() * walks / mean[part].sum() / unit
+        expected = splat_share(alpha if kind == "rough" else None, g)
+        assert 1 / within < share / expected < within, f"decade -{decade}: {share:.3f}"

@@ -1,0 +1,74 @@
+"""The simulation's noise beside the camera's: predicted before a run, measured after it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from disco_twin.camera.lars3 import Lars3, lars3_sensor
+from disco_twin.camera.sensor import expected_variance
+from disco_twin.noise import RADIANCES, measured_noise, splat, walks_below_camera
+from disco_twin.scene import Scene, load_scene
+from hw.record import to_radiance
+from pipeline.calibrate.camera import PinholeCamera
+
+SCENE = Path(__file__).parents[2] / "scenes" / "quick.toml"
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return load_scene(SCENE)
+
+
+@pytest.mark.parametrize("radiance", [1e-11, 1e-9, 3e-8, 1e-6, 2e-5])
+def test_expected_variance_is_that_of_exposures(scene: Scene, radiance: float) -> None:
+    """Rationale: walks are counted against the camera's noise; an exposure too long halves it.
+
+    Expected behaviour: the variance of 20 000 exposed pixels, within five standard errors; near a decision between
+    exposures it lies between those of the two.
+    """
+    sensor = lars3_sensor(scene.rig)
+    camera = Lars3(sensor, np.ones((100, 200), np.float32))
+    raw = camera.expose(np.full((100, 200), radiance, np.float32), 0, np.random.default_rng(1))
+    assert np.ptp(raw.exponent) == 0
+    found = to_radiance(raw, sensor, 0).radiance.astype(float).var()
+    expected = float(expected_variance(np.array([radiance]), sensor, 0)[0])
+    assert found == pytest.approx(expected, rel=5 * np.sqrt(2 / 20_000))
+
+
+def test_more_light_in_a_splat_asks_for_more_walks(scene: Scene) -> None:
+    """Expected behaviour: the simulation's variance s P L / N is below the camera's everywhere at the N that is
+    stated, and not at half of it; a smoother boundary asks for more.
+    """
+    sensor, s, walks = lars3_sensor(scene.rig), splat(scene), walks_below_camera(scene)
+    worst = [
+        (laser.power_mw * 1e-3 * s * RADIANCES / walks / expected_variance(RADIANCES, sensor, k)).max()
+        for k, laser in enumerate(scene.rig.lasers)
+    ]
+    assert max(worst) == pytest.approx(1.0)
+    smooth = scene.object.boundary.model_copy(update={"alpha": 0.05})
+    smoother = scene.model_copy(update={"object": scene.object.model_copy(update={"boundary": smooth})})
+    assert walks_below_camera(smoother) > 2 * walks
+
+
+def test_measured_noise_reads_the_variances(scene: Scene, tmp_path: Path) -> None:
+    """Expected behaviour: with variances made to be four times the camera's, twice its noise, everywhere above it, and
+    four times the walks to mend it; nothing where nothing was simulated.
+    """
+    assert measured_noise(scene, tmp_path) is None
+    sensor = lars3_sensor(scene.rig)
+    camera = PinholeCamera.from_config(scene.rig.cameras[0])
+    mean = np.random.default_rng(2).uniform(1e-9, 1e-4, (3, 2, len(scene.rig.lasers), 8, camera.width))
+    mean[..., :9] = 0.0
+    variance = np.zeros_like(mean)
+    for k, laser in enumerate(scene.rig.lasers):
+        watts = laser.power_mw * 1e-3
+        variance[:, :, k] = 4 * expected_variance(watts * mean[:, :, k], sensor, k) / watts**2
+    np.save(tmp_path / "spots-1.npy", np.stack([mean, variance]).astype(np.float32))
+    found = measured_noise(scene, tmp_path)
+    assert found is not None
+    assert found["median_over_camera"] == pytest.approx(2.0, rel=1e-3)
+    assert found["above_camera"] == 1.0
+    assert found["walks_below_camera"] == pytest.approx(4 * scene.simulation.walks_per_spot, rel=1e-3)
