@@ -199,3 +199,21 @@ def test_points_of_the_surface_are_found_in_the_image_where_nothing_hides_them()
     reading = bilinear_reading(scan, camera, 1.3, 80.0)
     vertex = np.argmin(np.linalg.norm(scan.vertices - points[hidden[0]], axis=1))
     assert reading.share[vertex] == 0.0
+
+
+@pytest.mark.parametrize("limit", [40.0, 60.0, 75.0])
+def test_surface_seen_at_a_grazing_angle_is_not_read(limit: float) -> None:
+    """Rationale: on a sphere the angle of view is known everywhere. Expected: read up to the limit, and nothing beyond
+    (but for the third of a degree by which facets and interpolated normals differ from the sphere).
+    """
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=15.0)
+    camera = wide_camera((0.0, -200.0, 0.0), 38.0)
+    for reading in (footprint_reading, bilinear_reading):
+        share = reading(ball, camera, 1.3, limit).share
+        towards = camera.position - ball.vertices
+        angle = np.rad2deg(np.arccos((ball.vertices * towards).sum(axis=1) / np.linalg.norm(towards, axis=1) / 15.0))
+        hat = np.rad2deg(ball.edges_unique_length.max() / 15.0)
+        assert share[angle > limit + hat + 0.4].max() == 0.0
+        assert (share[angle < limit - hat - 4.0] > 0.5).all()
+    cosine = see_surface(ball, camera, limit).cosine
+    assert np.cos(np.deg2rad(limit)) < cosine.min() < np.cos(np.deg2rad(limit - 4.0))
