@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from disco_twin.camera.lens import Glare
 from disco_twin.deviation import ActualRig, actual_rig
 from disco_twin.folder import RunFolder, write_atomically
 from disco_twin.pipeline_process import reconstruct_apart
@@ -42,11 +43,15 @@ class VariantFolder(RunFolder):
 
 
 def true_calibration(rig: RigConfig, actual: ActualRig, nominal: Calibration) -> Calibration:
-    """The calibration that a measurement without error would give. Each mirror move's own error stays out of reach."""
+    """The calibration that a measurement without error would give. Each mirror move's own error stays out of reach.
+
+    A lens that throws light outside the image is a little darker: all images lose the same share.
+    """
     views = []
     for v, view in enumerate(nominal.views):
         camera, angle = divmod(v, nominal.n_angles)
         lens = actual.camera(camera, angle)
+        kept = Glare.of(lens.height, lens.width).kept() if rig.faults.flare else 1.0
         views.append(
             view.model_copy(
                 update={
@@ -54,7 +59,7 @@ def true_calibration(rig: RigConfig, actual: ActualRig, nominal: Calibration) ->
                     "centre_px": pair(lens.centre),
                     "distortion": tuple(float(x) for x in lens.distortion),
                     "object_to_camera": pose_rows(lens.pose),
-                    "radiance_factor": tuple(float(x) for x in actual.photodiode / actual.response[camera]),
+                    "radiance_factor": tuple(float(x) for x in actual.photodiode / (kept * actual.response[camera])),
                 }
             )
         )

@@ -127,9 +127,9 @@ def _projector(found: Found) -> Iterator[Row]:
     shift, error = found["peak_shift_mm"], found["peak_shift_error_mm"]
     yield (
         "shift of the peak (Godin et al. 2001)",
-        f"{_pm(shift['along_light'], error['along_light'], 3)} mm along the light, "
-        f"{_pm(shift['towards_camera'], error['towards_camera'], 3)} mm towards the camera",
-        "per unit of the direction's tangential part: light that scatters below the surface leaves beside the beam",
+        f"{_pm(shift['per_sine'], error['per_sine'], 3)} mm sin(t) + "
+        f"{_pm(shift['per_cubed_sine'], error['per_cubed_sine'], 3)} mm sin(t)^3",
+        "along the light's way and towards the camera, t from the normal: light leaves the surface beside the beam",
     )
 
 

@@ -44,6 +44,12 @@ class Glare:
         spread = GLARE_SHARE * (0.5 * halo / halo.sum() + 0.5 / halo.size)
         return cls(height, width, scipy.fft.rfft2(spread.astype(np.float32)))
 
+    def kept(self) -> float:
+        """Share of the light of the image's middle that stays in the image; of other places nearly the same."""
+        middle = np.zeros((self.height, self.width), np.float32)
+        middle[self.height // 2, self.width // 2] = 1.0
+        return float(self(middle).sum(dtype=np.float64))
+
     def __call__(self, image: F32) -> F32:
         """(height, width) radiance -> the same with its glare."""
         shape = (2 * self.height - 1, 2 * self.width - 1)

@@ -112,7 +112,8 @@ def _axis(poses: PoseFit) -> dict[str, Any] | None:
 def _projector(fit: ProjectorFit) -> dict[str, Any]:
     """residual_mm: of spots across the beam; direction_error_deg, spot_error_mm: of beams that light the object.
 
-    peak_shift_mm: by which a spot's peak moves per unit of the direction's tangential part (Godin et al. 2001)
+    peak_shift_mm: by which a spot's peak moves along the light's way and towards the camera (Godin et al. 2001), per
+    sine of the angle to the normal, and per its cube
     """
     error = np.sqrt(np.diag(fit.covariance))
     return {
@@ -126,8 +127,8 @@ def _projector(fit: ProjectorFit) -> dict[str, Any]:
         "direction_error_deg": float(np.rad2deg(np.linalg.norm(error[:2]))),
         "full_angle_deg": _floats(np.rad2deg(fit.projector.full_angle_rad)),
         "full_angle_error_deg": _floats(np.rad2deg(error[6:8])),
-        "peak_shift_mm": {"along_light": float(fit.shift[0]), "towards_camera": float(fit.shift[1])},
-        "peak_shift_error_mm": {"along_light": float(fit.shift_error[0]), "towards_camera": float(fit.shift_error[1])},
+        "peak_shift_mm": {"per_sine": float(fit.shift[0]), "per_cubed_sine": float(fit.shift[1])},
+        "peak_shift_error_mm": {"per_sine": float(fit.shift_error[0]), "per_cubed_sine": float(fit.shift_error[1])},
     }
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
+from scipy.linalg import block_diag
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from hw.errors import DiscoError, InputError
@@ -45,9 +46,7 @@ F64 = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 
-PLATE_DISTANCE_MM = 2.0  # how well a ruler knows the plate's distance from the projector
 FALSE_STEPS = 60.0  # a spot that a matrix misses by more is false
-SHIFT_MODEL = 0.2  # share of a peak's shift that does not follow the model
 PATCH_MM = 10.0  # within which the object moves the peaks of spots alike
 PLATE_SPOT_MM = 0.05  # how well a spot's place on the white plate is seen
 
@@ -228,7 +227,8 @@ def plane_measurement(
     to_object = np.linalg.inv(poses.views[best * len(angles)].pose)
     to_projector = nominal.seen_from(turn(angles[0])).pose @ to_object
     local = here.plate_points @ to_projector[:3, :3].T + to_projector[:3, 3]
-    return step_size(local[:, :2], here.plate_steps, local[:, 2], PLATE_DISTANCE_MM, nominal, PLATE_SPOT_MM)
+    depth = float(poses.translation[best * len(angles), 2])
+    return step_size(local[:, :2], here.plate_steps, local[:, 2], depth, nominal, PLATE_SPOT_MM)
 
 
 @dataclass(frozen=True)
@@ -311,15 +311,14 @@ def measure_projector(
 
 
 def with_pose_error(fit: ProjectorFit, poses: PoseFit, view: int) -> ProjectorFit:
-    """The same with what its own residuals cannot show.
+    """The same with what its residuals cannot show: the object's pose before the camera that saw most spots.
 
-    It shares the error of the object's rotation before the camera that saw most spots; and a peak's shift is only
-    nearly linear in the directions, which moves all spots alike.
+    Only what moves the object in the image: along the line of sight, spots stay where they were seen.
     """
     to_projector = fit.projector.pose[:3, :3] @ poses.views[view].pose[:3, :3].T
+    across = block_diag(to_projector, to_projector @ np.diag([1.0, 1.0, 0.0]))
     covariance = fit.covariance.copy()
-    covariance[:3, :3] += to_projector @ np.diag(poses.rotation[view] ** 2) @ to_projector.T
-    covariance[3:5, 3:5] += (SHIFT_MODEL * float(np.abs(fit.shift).max())) ** 2 * np.eye(2)
+    covariance[:6, :6] += across @ poses.image_covariance[view] @ across.T
     return replace(fit, covariance=covariance)
 
 

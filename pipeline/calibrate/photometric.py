@@ -11,17 +11,21 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from pipeline.calibrate.camera import PinholeCamera
 
 F64 = NDArray[np.float64]
 
-MODEL_ERROR = 2.5e-3  # share: light that the lens throws outside the image, area per pixel, what the plate scatters
+CHANCE = 1e-3  # that places differ as much by chance; if less probable, the plate's places count as the error
 
 
 @dataclass(frozen=True)
 class Balance:
     """factor: (L,) what radiances are to be multiplied with, so that they agree with the photodiode; error: (L,) of it.
+
+    Light that the lens throws outside the image is part of the factor: images of the object lose the same share. The
+    error does not contain that of the plate's own share, which is alike for all cameras.
 
     drift: (L,) (largest - smallest) / mean of the plate's light over the whole time; scatter: (L,) standard deviation
     of the same after division by the photodiode, exposure by exposure (speckle on the plate included)
@@ -52,12 +56,14 @@ def balance(light: F64, reading: F64, share: F64, place: NDArray[np.int64]) -> B
     place: (N,) which exposures were made in one place of the plate; a plate's pose errs for all of them alike
     """
     ratio = np.pi * light / (share[:, None] * reading)
-    places = np.unique(place)
+    places, which, count = np.unique(place, return_inverse=True, return_counts=True)
     mean = np.stack([ratio[:, place == p].mean(axis=1) for p in places], axis=1)
-    rest = np.concatenate([ratio[:, place == p] / m[:, None] - 1 for p, m in zip(places, mean.T, strict=True)], axis=1)
+    rest = ratio / mean[:, which] - 1
     scatter = np.sqrt((rest**2).sum(axis=1) / max(rest.shape[1] - len(places), 1))
-    value = mean.mean(axis=1)
-    within = scatter / np.sqrt(ratio.shape[1])
-    between = mean.std(axis=1, ddof=1) / value / np.sqrt(len(places)) if len(places) > 1 else np.zeros(len(value))
+    value = ratio.mean(axis=1)
+    # Exposures of one place scatter by speckle alone; places differ by more only where a plate's pose is wrong.
+    freedom = len(value) * (len(places) - 1)
+    apart = float((count * ((mean / value[:, None] - 1) / scatter[:, None]) ** 2).sum())
+    excess = np.sqrt(apart / freedom) if freedom and apart > chi2.isf(CHANCE, freedom) else 1.0
     drift = (light.max(axis=1) - light.min(axis=1)) / light.mean(axis=1)
-    return Balance(1.0 / value, np.hypot(np.hypot(within, between), MODEL_ERROR) / value, drift, scatter)
+    return Balance(1.0 / value, scatter * excess / np.sqrt(ratio.shape[1]) / value, drift, scatter)

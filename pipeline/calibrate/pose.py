@@ -35,6 +35,7 @@ COMMON_EDGE_PX, PATCHES = (
     0.003,
     8,
 )  # edges of a camera may be off together: by this, and as much as that many patches are
+SCAN_LENGTH_MM, NEAR_MM, MOST_EDGES = 10.0, 2.0, 1200  # see `_surface_error`
 LENS = 4  # focal, centre x, y, k1
 HELD = 1e-7  # pixels: a lens does not follow the silhouettes
 
@@ -45,6 +46,8 @@ class PoseFit:
 
     rotation, translation: (V, 3) standard deviations of each view's pose: of the object about its own origin, in rad
     along the camera's axes, and of the origin, mm; residual_px: root mean square of the edges; edges: their number
+    image_covariance: (V, 6, 6) the same rotation and translation as far as they move the object in the image, that is
+    without what the lens leaves open; surface_mm: by how much the mesh is off over whole patches, as the edges show it
     ambiguity: directions that the silhouettes leave open, in words; empty if there is none
     xor_pixels: per view, the thesis's measure of mismatch (figure 5.1)
     axis, axis_error: (4,) of the turntable in the object frame at the first angle: rotation vector about x and y by
@@ -57,6 +60,8 @@ class PoseFit:
     translation: F64
     residual_px: float
     edges: int
+    image_covariance: F64
+    surface_mm: float = 0.0
     ambiguity: tuple[str, ...] = ()
     xor_pixels: tuple[int, ...] = ()
     axis: F64 = field(default_factory=lambda: np.zeros(0))
@@ -250,11 +255,11 @@ def _fine(
     """Gauss-Newton on the edges, then the covariance from what the edges leave unexplained, sector by sector."""
     precision = _priors(sweep)
     total: F64 = np.zeros(sweep.size)
-    rows: list[tuple[F64, F64, F64, NDArray[np.int64]]] = []
+    rows: list[tuple[F64, F64, F64, NDArray[np.int64], F64]] = []
     variance = 0.05**2
     for last in range(FINE_STEPS):
         rows = [_edges_of(sweep, v, image, mesh, last >= FINE_STEPS - EXACT_STEPS) for v, image in enumerate(images)]
-        j, rest, length, sector = (np.concatenate([r[k] for r in rows]) for k in range(4))
+        j, rest, length, sector, place = (np.concatenate([r[k] for r in rows]) for k in range(5))
         if not len(rest):
             raise DiscoError(
                 "the silhouettes show no edge near the scan's outline. Remedy: check that the scan is of this object, "
@@ -276,19 +281,52 @@ def _fine(
         together = np.hypot(COMMON_EDGE_PX, np.sqrt(variance / PATCHES))
         push = j[common].T @ weight[common] * (together / variance)
         meat += np.outer(push, push)
+    surface, push = _surface_error(j, rest - j @ step, weight / variance, length, place, inverse)
+    meat += surface**2 * push
     # Lenses are held where the boards put them, but their errors are passed on (Schmidt's consider covariance).
     held = _lens_rows(sweep)
     follow = -inverse[:, ~held] @ hessian[np.ix_(~held, held)]
     follow[held] = np.eye(int(held.sum()))
     meat[held], meat[:, held] = 0.0, 0.0
-    covariance = inverse @ (meat + np.where(held, 0.0, precision)) @ inverse + follow @ block_diag(*lens) @ follow.T
-    return _result(sweep, covariance, float(np.sqrt(variance)), len(rest), masks, mesh)
+    image = inverse @ (meat + np.where(held, 0.0, precision)) @ inverse
+    covariance = image + follow @ block_diag(*lens) @ follow.T
+    found = _result(sweep, covariance, image, float(np.sqrt(variance)), len(rest), masks, mesh)
+    return replace(found, surface_mm=surface)
+
+
+def _surface_error(j: F64, rest: F64, weight: F64, length: F64, place: F64, inverse: F64) -> tuple[float, F64]:
+    """By how much the mesh is off over whole patches, mm; (P, P) what one millimetre of it does to the gradient.
+
+    j: (K, P), rest: (K,) pixels that the fit leaves, weight: (K,) 1/pixels^2, length: (K,) pixels of outline, place:
+    (K, 4) object frame, mm, and pixels per mm, inverse: (P, P) of the fit's precision. A scanner errs alike over some
+    SCAN_LENGTH_MM (a Gaussian correlation), edges err each for itself. Both variances follow from two quadratic forms
+    of what the fit leaves: its squares, and its products between places that are near but not adjacent (Rao's variance
+    components). The fit takes a part of the errors for motion; the forms' expectations take that into account.
+    """
+    every = -(-len(rest) // MOST_EDGES)
+    j, rest, weight, length, place = j[::every], rest[::every], weight[::every] * every, length[::every], place[::every]
+    apart = np.linalg.norm(place[:, None, :3] - place[None, :, :3], axis=2)
+    alike = np.exp(-((apart / SCAN_LENGTH_MM) ** 2)) * np.outer(place[:, 3], place[:, 3])
+    taken = inverse @ (j * weight[:, None]).T  # (P, K)
+
+    def left(covariance: F64) -> F64:
+        """What is left of errors of a (K, K) covariance: (1 - j taken) covariance (1 - j taken)^T."""
+        moved = j @ (taken @ covariance)
+        return np.asarray(covariance - moved - moved.T + j @ (taken @ covariance @ taken.T) @ j.T)
+
+    own, common = left(np.eye(len(rest))), left(alike)
+    forms = [np.diag(length), np.outer(length, length) * alike * ((apart > NEAR_MM) & (apart < SCAN_LENGTH_MM))]
+    expected = np.array([[float((f * c).sum()) for c in (own, common)] for f in forms])
+    variances = np.linalg.solve(expected, [float(rest @ f @ rest) for f in forms])
+    push = j.T @ (weight[:, None] * alike * weight) @ j
+    return float(np.sqrt(max(variances[1], 0.0))), push
 
 
 def _edges_of(
     sweep: _Sweep, view: int, image: NDArray[np.floating], mesh: trimesh.Trimesh, exact: bool
-) -> tuple[F64, F64, F64, NDArray[np.int64]]:
-    """One view's rows: (K, P) derivative of the edge's place, (K,) pixels it is off, (K,) weight, (K,) sector.
+) -> tuple[F64, F64, F64, NDArray[np.int64], F64]:
+    """One view's rows: (K, P) derivative of the edge's place, (K,) pixels it is off, (K,) weight, (K,) sector, (K, 4)
+    the place itself, object frame, and pixels per mm of the surface's motion along its normal.
 
     exact: where the edge is found in a synthetic image of the same pose is taken off, and with it the edge model's bias
     """
@@ -303,12 +341,16 @@ def _edges_of(
     sector: NDArray[np.int64] = view * SECTORS + np.minimum((around / (2 * np.pi) + 0.5) * SECTORS, SECTORS - 1).astype(
         np.int64
     )
-    return j[good], away[good], rim.length[good], sector[good]
+    depth = rim.points @ camera.pose[2, :3] + camera.pose[2, 3]
+    scale = camera.focal.mean() / (depth * np.linalg.norm(rim.across[:, :2], axis=1))
+    place = np.column_stack([rim.points, scale])
+    return j[good], away[good], rim.length[good], sector[good], place[good]
 
 
 def _result(
     sweep: _Sweep,
     covariance: F64,
+    image: F64,
     residual: float,
     edges: int,
     masks: Sequence[NDArray[np.bool_]],
@@ -316,10 +358,11 @@ def _result(
 ) -> PoseFit:
     views = [sweep.view(v) for v in range(len(masks))]
     rotation, translation = np.zeros((len(views), 3)), np.zeros((len(views), 3))
+    own_image = np.zeros((len(views), 6, 6))
     ambiguity: list[str] = []
     for v, view in enumerate(views):
         j = _pose_jacobian(sweep, v)
-        own = j @ covariance @ j.T
+        own, own_image[v] = j @ covariance @ j.T, j @ image @ j.T
         rotation[v], translation[v] = np.sqrt(np.diag(own)[:3]), np.sqrt(np.diag(own)[3:])
         for values, vectors, limit, what in (
             (*np.linalg.eigh(own[:3, :3]), UNDETERMINED_RAD, "rotation about"),
@@ -340,6 +383,8 @@ def _result(
         translation,
         residual,
         edges,
+        own_image,
+        0.0,
         tuple(ambiguity),
         xor,
         sweep.axis[: len(spread)],

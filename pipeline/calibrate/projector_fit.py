@@ -23,7 +23,9 @@ Flags = NDArray[np.bool_]
 DRAWS, SAMPLE = 400, 8
 LEAST_SPOTS = 12
 FLAT = 0.02  # of the spots' extent: thinner than this they are nearly coplanar
-PLACE_MM, PLACE_RAD, ANGLE_SHARE = 5.0, np.deg2rad(1.0), 0.01  # what the set-up keeps to, standard deviations
+# What the set-up keeps to, standard deviations: the projector's place (by tape measure) and direction, its full angles.
+PLACE_MM, PLACE_RAD, ANGLE_SHARE = 1.0, np.deg2rad(0.5), 0.01
+SHIFT_MM = 1.0  # by which a spot's peak may move, per unit of a direction's sine and of its cube
 HUBER = 2.0  # in units of the spots' own scatter
 GATE = 5.0  # beyond this many scatters a spot is false
 STEPS = 15
@@ -109,10 +111,15 @@ def _misses(matrix: F64, points: F64, steps: F64) -> F64:
 
 @dataclass(frozen=True)
 class StepSize:
-    """full_angle_rad: (2,) over all steps; error_rad: (2,) standard deviations."""
+    """full_angle_rad: (2,) over all steps; error_rad: (2,) standard deviations.
+
+    distance_mm: at which the plane stands if the projector stands where it was built to; as much as it is farther, the
+    angles were measured too large. None: not measured from a plane
+    """
 
     full_angle_rad: F64
     error_rad: F64
+    distance_mm: float | None = None
 
 
 def step_size(
@@ -135,7 +142,7 @@ def step_size(
         spread = noise / np.sqrt(((design[:, 0] - design[:, 0].mean()) ** 2).sum())
         full[k] = projector.full_angle_rad[k] * slope
         error[k] = projector.full_angle_rad[k] * np.hypot(spread, distance_error / distance.mean())
-    return StepSize(full, error)
+    return StepSize(full, error, float(distance.mean()))
 
 
 @dataclass(frozen=True)
@@ -145,8 +152,8 @@ class ProjectorFit:
 
     rms_mm: of the true spots across the beam; false: (N,) spots left out
 
-    shift: (2,) mm by which a spot's peak moves along the light's way and towards the eye, per unit of the direction's
-    tangential part (Godin et al. 2001), and its standard deviations
+    shift: (2,) mm by which a spot's peak moves along the light's way and, by reciprocity, towards the eye (Godin et al.
+    2001): per unit of the direction's tangential part, and of its cube; and its standard deviations
     images, sightings: how many were looked at, and how many of them show the spot itself
     """
 
@@ -181,9 +188,7 @@ def refine(
     """
     nominal = start.full_angle_rad
     known = StepSize(nominal, nominal * ANGLE_SHARE) if size is None else size
-    sigma = np.concatenate([[PLACE_RAD] * 3, [PLACE_MM] * 3, known.error_rad, [1.0, 1.0]])
-    target = np.concatenate([np.zeros(6), known.full_angle_rad, [0.0, 0.0]])
-    precision = np.diag(sigma**-2)
+    precision, target = _known(start, known)
     value = np.concatenate([np.zeros(6), nominal, [0.0, 0.0]])
     group = np.arange(len(points)) if group is None else group
     scatter = np.inf
@@ -215,6 +220,26 @@ def refine(
     )
 
 
+def _known(start: TwoMirrorProjector, size: StepSize) -> tuple[F64, F64]:
+    """(10, 10) precision and (10,) mean of the unknowns before any spot is seen."""
+    # The projector is off by a rotation r about itself and a shift t; the object's origin at x moves by r x x + t.
+    x, y, z = start.pose[:3, 3]
+    lever = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0.0]])
+    along = np.vstack([np.eye(3), lever]) * PLACE_RAD
+    place = along @ along.T
+    place[3:, 3:] += PLACE_MM**2 * np.eye(3)
+    precision = np.zeros((10, 10))
+    precision[:6, :6] = np.linalg.inv(place)
+    precision[8:, 8:] = SHIFT_MM**-2 * np.eye(2)
+    for k in (0, 1):
+        row = np.zeros(10)
+        row[6 + k] = 1.0
+        if size.distance_mm is not None:
+            row[5] = size.full_angle_rad[k] / size.distance_mm
+        precision += np.outer(row, row) / size.error_rad[k] ** 2
+    return precision, np.concatenate([np.zeros(6), size.full_angle_rad, [0.0, 0.0]])
+
+
 def _moved(start: TwoMirrorProjector, value: F64) -> TwoMirrorProjector:
     pose = start.pose.copy()
     pose[:3, :3] = Rotation.from_rotvec(value[:3]).as_matrix() @ pose[:3, :3]
@@ -226,15 +251,17 @@ def _across(start: TwoMirrorProjector, value: F64, points: F64, steps: F64, norm
     """(N, 2) mm from the beam's axis to the spots, in two fixed directions across it; the peak's shift is taken off."""
     projector = _moved(start, value)
     origin, way = projector.rays(steps)
-    true = points - value[8] * _tangential(way, normals) - value[9] * _tangential(to_eye, normals)
+    true = points - _peak_shift(value[8:], way, normals) - _peak_shift(value[8:], to_eye, normals)
     right, down = projector.pose[0, :3], projector.pose[1, :3]
     away = true - origin
     away = away - (away * way).sum(axis=1, keepdims=True) * way
     return np.column_stack([away @ right, away @ down])
 
 
-def _tangential(direction: F64, normals: F64) -> F64:
-    return np.asarray(direction - (direction * normals).sum(axis=1, keepdims=True) * normals)
+def _peak_shift(shift: F64, direction: F64, normals: F64) -> F64:
+    """(N, 3) mm."""
+    tangential = direction - (direction * normals).sum(axis=1, keepdims=True) * normals
+    return np.asarray((shift[0] + shift[1] * (tangential**2).sum(axis=1, keepdims=True)) * tangential)
 
 
 def _derivative(start: TwoMirrorProjector, value: F64, points: F64, steps: F64, normals: F64, to_eye: F64) -> F64:

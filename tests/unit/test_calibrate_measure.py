@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from calibrate_twin import capture_all, world
+from calibrate_twin import SHIFT, capture_all, world
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
@@ -119,8 +119,8 @@ def test_a_rig_is_calibrated_from_its_own_images(captured: tuple[Path, RigConfig
         np.array(report["photometric"]["power_scatter"]) < 0.012
     ).all()  # five per cent of speckle on some thirty pixels
     spots = report["projector"]
-    for end, shift in spots["peak_shift_mm"].items():  # as `Glowing` moves its peaks
-        assert abs(shift - 0.1) < 4 * spots["peak_shift_error_mm"][end]
+    for (name, shift), truth in zip(spots["peak_shift_mm"].items(), SHIFT, strict=True):
+        assert abs(shift - truth) < 4 * spots["peak_shift_error_mm"][name]
     assert 0.2 < spots["hidden"] / spots["images"] < 0.8  # one camera looks from behind
     assert spots["used"] + spots["false"] + spots["hidden"] <= spots["images"]
     tilt, place = true_axis(actual_rig(rig, 11).turns)

@@ -189,8 +189,8 @@ MEASURED = {
         "direction_error_deg": 0.085,
         "full_angle_deg": [5.9854, 6.0066],
         "full_angle_error_deg": [0.014, 0.0145],
-        "peak_shift_mm": {"along_light": 0.089, "towards_camera": 0.102},
-        "peak_shift_error_mm": {"along_light": 0.033, "towards_camera": 0.036},
+        "peak_shift_mm": {"per_sine": 0.089, "per_cubed_sine": 0.102},
+        "peak_shift_error_mm": {"per_sine": 0.033, "per_cubed_sine": 0.036},
     },
 }
 
@@ -209,7 +209,7 @@ def test_the_calibration_is_told_with_its_uncertainty() -> None:
         "rotation about &lt;z&gt;",
         "86 used, 91 hidden, 3 false",
         "+- 0.033 mm",
-        "0.089 +- 0.033 mm along the light, 0.102 +- 0.036 mm towards the camera",
+        "0.089 +- 0.033 mm sin(t) + 0.102 +- 0.036 mm sin(t)^3",
     ):
         assert shown in body
     assert "axis</td><td class='text'>tilt" not in section(MEASURED | {"axis": None}, [635.0])[1]
