@@ -41,6 +41,7 @@ class TargetSource:
     actual: ActualRig
     beam_radius: float
     _seen: tuple[int, F64, float] | None = field(default=None, init=False)
+    _lit: tuple[Aim, F32, bool] | None = field(default=None, init=False)
 
     @cached_property
     def _rays(self) -> tuple[F64, F64]:
@@ -98,6 +99,14 @@ class TargetSource:
 
     def image(self, camera: int, aim: Aim, laser: int) -> F32:
         """(H, W) radiance of the plate in 1/(mm^2 sr), per watt of laser power."""
+        if self._lit is None or self._lit[0] != aim:  # the lasers differ in the plate's share alone
+            self._lit = aim, *self._spot(aim)
+        _, light, same_side = self._lit
+        share = self.targets.reflected if same_side else self.targets.transmitted
+        return np.asarray(light * np.float32(share[laser] / np.pi))
+
+    def _spot(self, aim: Aim) -> tuple[F32, bool]:
+        """(H, W) light that leaves the plate, 1/mm^2, if all of it did; whether the camera sees the lit side."""
         (xy, side), pose = self._plane(aim.angle), self.pose(aim.angle)
         start, way = self.actual.projector.rays(self.actual.steps(aim)[None])
         o, d = pose[:3, :3].T @ (start[0] - pose[:3, 3]), pose[:3, :3].T @ way[0]
@@ -106,8 +115,7 @@ class TargetSource:
         lit = squared - (away @ d[:2]) ** 2 < self.beam_radius**2
         spread = (1 - HALO_SHARE) * lit * abs(d[2]) / (np.pi * self.beam_radius**2)
         spread = spread + HALO_SHARE * np.exp(-np.sqrt(squared) / HALO_MM) / (2 * np.pi * HALO_MM**2)
-        share = self.targets.reflected if side == np.sign(o[2]) else self.targets.transmitted
-        return self._pixels(spread * share[laser] / np.pi)
+        return self._pixels(spread), bool(side == np.sign(o[2]))
 
     def _pixels(self, fine: F64) -> F32:
         s, camera = SUPERSAMPLE, self.camera

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from hw.errors import DiscoError
 from pipeline.calibrate.camera import PinholeCamera, turn
 from pipeline.calibrate.outline import Outline, edges_along, mesh_mask, object_mask, outline, signed_distance, synthetic
+from pipeline.calibrate.scan_error import surface_error
 
 F64 = NDArray[np.float64]
 
@@ -35,7 +36,6 @@ COMMON_EDGE_PX, PATCHES = (
     0.003,
     8,
 )  # edges of a camera may be off together: by this, and as much as that many patches are
-SCAN_LENGTH_MM, NEAR_MM, MOST_EDGES = 10.0, 2.0, 1200  # see `_surface_error`
 LENS = 4  # focal, centre x, y, k1
 HELD = 1e-7  # pixels: a lens does not follow the silhouettes
 
@@ -281,8 +281,8 @@ def _fine(
         together = np.hypot(COMMON_EDGE_PX, np.sqrt(variance / PATCHES))
         push = j[common].T @ weight[common] * (together / variance)
         meat += np.outer(push, push)
-    surface, push = _surface_error(j, rest - j @ step, weight / variance, length, place, inverse)
-    meat += surface**2 * push
+    surface, push = surface_error(j, rest - j @ step, weight / variance, length, place, inverse)
+    meat += push
     # Lenses are held where the boards put them, but their errors are passed on (Schmidt's consider covariance).
     held = _lens_rows(sweep)
     follow = -inverse[:, ~held] @ hessian[np.ix_(~held, held)]
@@ -292,34 +292,6 @@ def _fine(
     covariance = image + follow @ block_diag(*lens) @ follow.T
     found = _result(sweep, covariance, image, float(np.sqrt(variance)), len(rest), masks, mesh)
     return replace(found, surface_mm=surface)
-
-
-def _surface_error(j: F64, rest: F64, weight: F64, length: F64, place: F64, inverse: F64) -> tuple[float, F64]:
-    """By how much the mesh is off over whole patches, mm; (P, P) what one millimetre of it does to the gradient.
-
-    j: (K, P), rest: (K,) pixels that the fit leaves, weight: (K,) 1/pixels^2, length: (K,) pixels of outline, place:
-    (K, 4) object frame, mm, and pixels per mm, inverse: (P, P) of the fit's precision. A scanner errs alike over some
-    SCAN_LENGTH_MM (a Gaussian correlation), edges err each for itself. Both variances follow from two quadratic forms
-    of what the fit leaves: its squares, and its products between places that are near but not adjacent (Rao's variance
-    components). The fit takes a part of the errors for motion; the forms' expectations take that into account.
-    """
-    every = -(-len(rest) // MOST_EDGES)
-    j, rest, weight, length, place = j[::every], rest[::every], weight[::every] * every, length[::every], place[::every]
-    apart = np.linalg.norm(place[:, None, :3] - place[None, :, :3], axis=2)
-    alike = np.exp(-((apart / SCAN_LENGTH_MM) ** 2)) * np.outer(place[:, 3], place[:, 3])
-    taken = inverse @ (j * weight[:, None]).T  # (P, K)
-
-    def left(covariance: F64) -> F64:
-        """What is left of errors of a (K, K) covariance: (1 - j taken) covariance (1 - j taken)^T."""
-        moved = j @ (taken @ covariance)
-        return np.asarray(covariance - moved - moved.T + j @ (taken @ covariance @ taken.T) @ j.T)
-
-    own, common = left(np.eye(len(rest))), left(alike)
-    forms = [np.diag(length), np.outer(length, length) * alike * ((apart > NEAR_MM) & (apart < SCAN_LENGTH_MM))]
-    expected = np.array([[float((f * c).sum()) for c in (own, common)] for f in forms])
-    variances = np.linalg.solve(expected, [float(rest @ f @ rest) for f in forms])
-    push = j.T @ (weight[:, None] * alike * weight) @ j
-    return float(np.sqrt(max(variances[1], 0.0))), push
 
 
 def _edges_of(

@@ -124,6 +124,7 @@ class Glowing:
         self.rig, self.actual, self.mesh = rig, actual, mesh
         self.ray = RayMeshIntersector(mesh)
         self._seen: dict[tuple[int, int], tuple[F64, F64, NDArray[np.bool_]]] = {}
+        self._last: tuple[tuple[int, Aim], F32] | None = None
 
     def prepare(self, aims: Sequence[Aim]) -> None:
         """Nothing to do."""
@@ -145,6 +146,11 @@ class Glowing:
         return self._seen[camera, angle]
 
     def image(self, camera: int, aim: Aim, laser: int) -> F32:
+        if self._last is None or self._last[0] != (camera, aim):  # the same for all lasers
+            self._last = (camera, aim), self._image(camera, aim)
+        return self._last[1]
+
+    def _image(self, camera: int, aim: Aim) -> F32:
         place, normal, hit = self._surface(camera, aim.angle)
         origin, way = (x[0] for x in self.actual.spot_rays([aim]))
         lens, radius = self.actual.camera(camera, aim.angle), self.rig.projector.beam_diameter_mm / 2

@@ -62,11 +62,10 @@ def judge(found: Measured, rig: RigConfig, seed: int, folder: Path) -> Judged:
     wide = (true.projector(0).full_angle_rad - own.projector(0).full_angle_rad) / errors.full_angle_error_rad
     turn = Rotation.from_matrix(b[:3, :3] @ a[:3, :3].T).as_rotvec() / errors.rotation_error_rad
     projector = np.concatenate([turn, (b - a)[:3, 3] / errors.translation_error_mm, wide])
-    lens = [
-        (actual.cameras[c].focal[0] - own.views[c * own.n_angles].focal_px[0])
-        / (own.views[c * own.n_angles].focal_error_px or 1.0)
-        for c in range(own.n_cameras)
-    ]
+    lens = []
+    for camera, real in zip(found.cameras, actual.cameras, strict=True):
+        truth = np.array([real.focal[0], *real.centre, real.distortion[0]])
+        lens.append((camera.intrinsics.values - truth) / np.sqrt(np.diag(camera.intrinsics.covariance)))
     ratio = [np.array(m.radiance_factor) / t.radiance_factor - 1 for m, t in zip(own.views, true.views, strict=True)]
     scores = {"pose": np.array(pose), "light": np.array(light), "projector": projector, "lens": np.array(lens)}
     kept = np.isfinite(away) & (away < 3.0)  # beyond: one of the two beams passes the rim
@@ -169,20 +168,19 @@ def test_a_rig_with_curved_cameras_is_calibrated_as_well(tmp_path: Path) -> None
 @pytest.mark.slow
 @pytest.mark.timeout(1500)
 def test_uncertainties_are_honest(tmp_path: Path) -> None:
-    """Twelve rigs: z-scores have a root mean square between .8 and 1.25 for poses, between .7 and 1.25 for the balance.
+    """Rationale: twelve rigs with all faults of light and place, and a source whose peaks wander as the twin's do.
 
-    Lenses are few. The projector's errors allow for a peak's shift that is not linear, and the source here is: its
-    scores may be small, not large.
+    Expected behaviour: z-scores of every calibration have a root mean square between .8 and 1.25. With the 72 (balance)
+    to 216 (poses) independent figures of twelve rigs, right uncertainties miss that once in 200 times.
     """
     scores: dict[str, list[F64]] = {}
-    for seed in range(12):
+    for seed in range(50, 62):
         folder = tmp_path / str(seed)
-        rig = capture_all(folder, 50 + seed)
-        judged = judge(measure(folder, rig, lars3_sensor(rig), world().object.mesh), rig, 50 + seed, folder)
+        rig = capture_all(folder, seed)
+        judged = judge(measure(folder, rig, lars3_sensor(rig), world().object.mesh), rig, seed, folder)
+        assert judged.spots_mm < 0.2, seed
+        assert judged.incidence_deg < 0.3, seed
         for name, z in judged.scores.items():
             scores.setdefault(name, []).append(z.ravel())
     rms = {name: float(np.sqrt((np.concatenate(z) ** 2).mean())) for name, z in scores.items()}
-    assert 0.8 < rms["pose"] < 1.25, rms
-    assert 0.7 < rms["light"] < 1.25, rms
-    assert 0.4 < rms["projector"] < 1.25, rms
-    assert 0.4 < rms["lens"] < 1.5, rms
+    assert all(0.8 < figure < 1.25 for figure in rms.values()), rms
