@@ -147,11 +147,6 @@ class FollowedHead:
         self.bench.heads[self.index].on_since = None
         self.head.off_now()
 
-    def force_off(self) -> None:
-        """No light."""
-        self.bench.heads[self.index].on_since = None
-        self.head.force_off()
-
     def close(self) -> None:
         """Switch off, and give the port back."""
         self.bench.heads[self.index].on_since = None

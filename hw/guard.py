@@ -131,8 +131,6 @@ class Relay:
                 self.port.write(data)
             if self.port.fileno() in readable:
                 self._heard = self.port.read(max(1, self.port.in_waiting))
-                if not self._heard:
-                    raise serial.SerialException("the port delivers nothing though it is ready: unplugged")
             if self._heard and (writable or source):
                 with contextlib.suppress(BlockingIOError):
                     self._heard = self._heard[self.host.send(self._heard, socket.MSG_DONTWAIT) :]
@@ -201,8 +199,7 @@ def guard(url: str, baud: int, host: socket.socket, program: Program) -> bool:
         return True
     relay, patience_s, ready = Relay(port, host), PATIENCE_S, False
     try:
-        _answers(port, OFF, re.compile(rb"!(LOf)"))
-        port.reset_input_buffer()  # the program asked for none of this
+        _answers(port, OFF, re.compile(rb"!(LOf[^\r]*)\r"))  # all of it: the program asked for none of this
         host.sendall(READY)
         ready = True
         log.info("%s: switching off: %s", url, relay.run(program))

@@ -43,7 +43,7 @@ class SerialRig:
         announce: Callable[[Sequence[Aim]], None] | None = None,
         centre: tuple[int, int] = (2048, 2048),
     ) -> None:
-        """`connect` closes what it has opened if it fails. `centre`: where the mirrors stand at first.
+        """`connect` shuts every line; if it fails it closes what it opened. `centre`: where the mirrors stand first.
 
         armed: lasers may emit; without it the rig refuses to be entered, before anything is connected.
         armed_line: a TTL line that is high as long as the rig is on: a warning lamp, and the witness that the board has
@@ -77,7 +77,6 @@ class SerialRig:
         try:
             gates = [wiring.gate_line for wiring in self.wiring]
             self._board = board = TrustedBoard(devices.board, self.clock, gates, self.cut)
-            board.shut()
             board.aim(*self._centre)
             devices.table.home()
             if self._armed_line is not None:
@@ -101,18 +100,14 @@ class SerialRig:
     def make_safe(self) -> None:
         """Gates shut, lasers and floodlight off, ports given back. Never raises; no device's failure stops another's.
 
-        First everybody is told, which takes no time; then each confirms, which a device that has fallen silent can draw
-        out for seconds.
+        First every laser is told, which takes no time; then each device confirms in being closed, which one that has
+        fallen silent can draw out for seconds. The board is told in the first step of being closed.
         """
         devices, self._devices, self._board, self.last_open = self._devices, None, None, -1
         if devices is None:
             return
-        steps: list[Callable[[], None]] = [devices.board.shut_now]
-        steps += [head.off_now for head in devices.heads]
-        steps += [lambda: self.clock.sleep(HEARD_S), devices.board.shut]
-        steps += [head.force_off for head in devices.heads]
-        steps += [head.close for head in devices.heads]
-        steps += [devices.board.close, devices.table.close]
+        told: list[Callable[[], None]] = [head.off_now for head in devices.heads]
+        steps = [*told, devices.board.close, *(head.close for head in devices.heads), devices.table.close]
         for step in steps:
             try:
                 step()

@@ -25,7 +25,10 @@ SETTLE_S = 0.005  # of the galvos, after the DAC has taken both values
 
 
 class TrustedBoard:
-    """A board, what it was told, and whether it still does that. `cut`: switch every light off in a hurry."""
+    """A board whose lines are all low, what it is told from then on, and whether it still does that.
+
+    `cut`: switch every light off in a hurry.
+    """
 
     def __init__(self, board: Board, clock: Clock, gate_lines: Sequence[int], cut: Callable[[], None]) -> None:
         self.board, self._clock, self._cut = board, clock, cut
@@ -63,11 +66,6 @@ class TrustedBoard:
         return self.ask(lambda board: board.counts(pin))
 
     # ---- TTL lines
-
-    def shut(self) -> None:
-        """Every line low."""
-        self.board.shut()
-        self._pattern = 0
 
     def lit(self, line: int) -> bool:
         """Whether a line is switched on, or may be."""

@@ -20,9 +20,11 @@ class Head(Protocol):
     def require_power(self, tolerance: float) -> float:
         """The laser's own reading in mW, refused where it is not its set point within this share."""
 
-    def off_now(self) -> None: ...
-    def force_off(self) -> None: ...
-    def close(self) -> None: ...
+    def off_now(self) -> None:
+        """Say off without waiting for the answer."""
+
+    def close(self) -> None:
+        """Switch off, confirmed, and give the port back."""
 
 
 class Board(Protocol):
@@ -35,9 +37,12 @@ class Board(Protocol):
     def set_lines(self, pattern: int) -> None: ...
     def lines(self) -> int: ...
     def shut_now(self) -> None: ...
-    def shut(self) -> None: ...
+    def shut(self) -> None:
+        """Every line low, confirmed; a board does so when it is connected."""
+
     def counts(self, pin: int) -> int: ...
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Shut every line, confirmed, and give the port back."""
 
 
 @dataclass(frozen=True)

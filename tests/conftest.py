@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 os.environ.setdefault("MPLBACKEND", "Agg")
-# A shell starts background jobs with SIGINT ignored, nohup with SIGHUP, and programs hand that on to their children;
-# the tests and their children are to take both as from a terminal.
+# A shell starts background jobs with SIGINT and SIGQUIT ignored, nohup with SIGHUP, and programs hand that on to their
+# children; the tests and their children are to take all three as from a terminal.
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
+signal.signal(signal.SIGQUIT, signal.SIG_DFL)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

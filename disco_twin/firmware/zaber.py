@@ -89,7 +89,7 @@ class ZaberFirmware:
         fields = [f"@{self.address:02d}", str(axis), *([] if number is None else [number])]
         fields += ["OK" if accepted else "RJ", busy, self.warnings(now)[0], data]
         reply = " ".join(fields)
-        if self.settings["comm.checksum"] == "1":
+        if self.settings.get("comm.checksum") == "1":
             reply += ":" + checksum(reply[1:])
         return f"{reply}\r\n".encode("ascii")
 
@@ -119,7 +119,7 @@ class ZaberFirmware:
                 return True, str(round(self.spindle.position(now) * self.microsteps_per_deg))
             case ["get", name] if name in self.settings:
                 return True, self.settings[name]
-            case ["set", name, value] if name in ("comm.checksum", "comm.alert", "maxspeed"):
+            case ["set", name, value] if name in self.settings and name in ("comm.checksum", "comm.alert", "maxspeed"):
                 self.settings[name] = value
                 return True, "0"
             case ["home"]:

@@ -24,6 +24,7 @@ T = TypeVar("T")
 
 MODELS = {3: "PhoxX", 4: "LuxX", 18: "LuxX+"}
 ANSWER_S = 0.5
+ATTEMPTS = 3
 EMISSION_S = 8.0  # LOn takes about 3 s
 RESET_S = 12.0  # RsC takes about 5 s
 POLL_S = 0.1
@@ -300,7 +301,7 @@ class OmicronLaser:
             self.link.close()
 
     def _set_power(self, share: float) -> None:
-        """TPP (not stored), or SLP where TPP is unknown: its memory wears out, so it is written on change only."""
+        """TPP (not stored), or SLP where TPP is unknown."""
         if self._temporary_power:
             try:
                 self._set("TPP", f"{100.0 * share:.5f}")
@@ -309,9 +310,27 @@ class OmicronLaser:
                 if "does not know" not in error.problem:
                     raise
                 self._temporary_power = False
-        level = round(share * LEVELS)
+        self._store_level(round(share * LEVELS))
+
+    def _store_level(self, level: int) -> None:
+        """SLP: the same level twice is the same level, but wears the memory that keeps it.
+
+        So it is written on change only, and not again because an answer was lost: the level itself says whether it was.
+        """
+        for _ in range(ATTEMPTS):
+            if round(self.level() * LEVELS) == level:
+                return
+            try:
+                answer = self._once("SLP", f"{level:03X}")
+            except NoAnswer as error:
+                log.warning("%s; asking for the level instead", error.without_remedy)
+                self._resynchronise()
+                continue
+            if answer.startswith("x"):
+                self._refuse(f"refused ?SLP{level:03X}")
         if round(self.level() * LEVELS) != level:
-            self._set("SLP", f"{level:03X}")
+            problem = f"did not keep level {level:03X} in {ATTEMPTS} attempts"
+            raise DeviceRefused(self.link.url, self.name, problem, "reset the laser, or switch it off and on")
 
     def _set_mode(self, add: int = 0, clear: int = 0) -> None:
         before = self.mode()

@@ -129,7 +129,9 @@ class Serial(SerialBase):
                 guard.wait(wait_s)
         if guard.returncode == OFF_AS_STOPPED:
             return "the program was stopped (Ctrl-Z or SIGSTOP), and the laser switched off for that time"
-        if guard.returncode in (None, IS_OFF, UNCONFIRMED):
+        if guard.returncode == UNCONFIRMED:
+            return "its guard has closed it, and THE LASER HAS NOT CONFIRMED THAT IT IS OFF: open its interlock"
+        if guard.returncode in (None, IS_OFF):
             return "its guard has closed it: the laser was switched off, or its cable pulled"
         status = guard.returncode
         self._rescue(guard)

@@ -130,3 +130,28 @@ def test_a_clock_of_its_own_for_real_rigs() -> None:
         rig.resume_at(100.0)
         clock.sleep(1.0)
         assert rig.now() == 101.0
+
+
+@pytest.mark.parametrize("error", [DeviceFault, KeyboardInterrupt])
+def test_what_fails_while_lasers_warm_up_leaves_nothing_on(error: type[BaseException]) -> None:
+    """Without the capture loop, which would make the rig safe once more."""
+    emulated = emulation()
+    rig, sleep = emulated.serial_rig(), emulated.clock.sleep
+    rig._warm_up_s = 60.0
+    lit = []
+
+    def disturbed(seconds: float) -> None:
+        sleep(seconds)
+        if seconds == 60.0:
+            lit.append([head.on_since is not None for head in emulated.bench.heads])
+            if error is KeyboardInterrupt:
+                raise KeyboardInterrupt
+            emulated.bench.heads[2].set_interlock(closed=False)
+
+    emulated.clock.sleep = disturbed  # type: ignore[method-assign]
+    with pytest.raises(error), rig:
+        raise AssertionError
+    assert lit == [[True] * 3]
+    assert [head.on_since for head in emulated.bench.heads] == [None] * 3
+    assert emulated.bench.board.lines == 0 and emulated.bench.hazards == []
+    assert not rig.connected

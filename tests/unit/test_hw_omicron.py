@@ -101,6 +101,39 @@ def test_without_temporary_power_the_memory_is_spared() -> None:
     assert laser.measured_mw() == 100.0
 
 
+@pytest.mark.parametrize("fault", ["answer lost", "answer late", "answer garbled", "command lost"])
+def test_a_lost_answer_does_not_write_the_memory_twice(fault: str) -> None:
+    """Rationale: SLP is idempotent in what it sets and not in what it wears. Expected: one write, and the level set."""
+    bench = LaserBench(head=LaserHead(532.0, 100.0, knows_temporary_power=False))
+    laser = bench.connect()
+    sent: list[bytes] = []
+    answers = {"answer lost": lost, "answer late": late(0.7), "answer garbled": garbled(1)}
+
+    def befall(data: bytes) -> bytes:
+        if data.startswith(b"?SLP"):
+            sent.append(data)
+            if len(sent) == 1 and fault == "command lost":
+                return b""
+            if len(sent) == 1:
+                bench.line.answer_faults.append(answers[fault])
+        return data
+
+    bench.line.command_faults.extend([befall] * 200)
+    laser.arm(40.0)
+    assert bench.head.memory_writes == 1 and len(sent) == (2 if fault == "command lost" else 1)
+    assert bench.head.stored_level == round(0.4 * 0xFFF)
+    laser.emit()
+    assert laser.measured_mw() == pytest.approx(40.0, abs=0.02)
+
+
+def test_a_level_that_is_not_kept_is_refused() -> None:
+    bench = LaserBench(head=LaserHead(532.0, 100.0, knows_temporary_power=False))
+    laser = bench.connect()
+    bench.line.command_faults.extend([lambda data: b"?GLP\r" if data.startswith(b"?SLP") else data] * 200)
+    with pytest.raises(DeviceRefused, match="did not keep level 666 in 3 attempts"):
+        laser.arm(40.0)
+
+
 # ---- interlock, key, reset
 
 

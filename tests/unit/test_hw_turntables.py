@@ -220,14 +220,19 @@ def test_bad_checksums_are_dropped_by_both_sides() -> None:
 
 
 def test_an_old_firmware_without_checksums_still_turns() -> None:
+    """It rejects the setting that would switch them on; what it says without them is trusted."""
     bench = TableBench()
-    firmware = ZaberFirmware(bench.spindle)
+    firmware, asked = ZaberFirmware(bench.spindle), list[bytes]()
     bench.line.firmware = firmware
     del firmware.settings["comm.checksum"]
-    firmware.settings["comm.checksum"] = "0"
-    bench.line.answer_faults.extend([None, lambda data: [(0.0, data.replace(b"OK", b"RJ").split(b":")[0] + b"\r\n")]])
+    bench.line.command_faults.extend([lambda data: (asked.append(data), data)[1]] * 20)
     table = bench.connect()
+    assert any(b"set comm.checksum 1" in command for command in asked)
+    assert "comm.checksum" not in firmware.settings
     table.home()
+    table.move(np.deg2rad(120.0))
+    assert degrees(bench) == pytest.approx(120.0, abs=0.003)
+    assert table.angle_rad() == pytest.approx(np.deg2rad(120.0), abs=1e-4)
 
 
 def test_other_messages_are_skipped() -> None:

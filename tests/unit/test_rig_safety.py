@@ -320,7 +320,7 @@ def test_probe_and_selftest_of_served_devices(
         with pytest.raises(SystemExit) as end:
             main(["rig", "probe", str(path), "--logs", str(tmp_path / "logs")])
         said = capsys.readouterr().out
-        assert end.value.code == 0 and said.count("ok  ") == 5 and "LuxX 532 nm, 10 mW" in said
+        assert end.value.code == 0 and said.count("ok  ") == 5 and "LuxX 532 nm, 10 mW" in said, said
         assert len(list((tmp_path / "logs").iterdir())) == 5
         findings = list(selftest(load_rig_file(path), None, armed=True))
         assert all(f.good for f in findings) and len(findings) == 10
@@ -478,6 +478,20 @@ def test_an_opening_whose_answer_was_lost_is_not_repeated_before_aiming_anew() -
         rig.lasers[0].close_gate()
     openings = [i for i, d in enumerate(sent) if d[:4] == b"\0\0\0\x01" and d[4] & 7]
     assert any(d[:1] == b"\x03" for d in sent[openings[0] : openings[1]])
+
+
+def test_no_gate_opens_before_the_rig_is_entered_anew_when_the_light_was_cut() -> None:
+    """The lasers were told off: their gates would let out nothing, or what a laser that did not hear still emits."""
+    emulated = emulation()
+    with emulated.serial_rig() as rig:
+        rig.cut()
+        with pytest.raises(
+            DeviceFault, match=r"lost an answer while a gate was open: the lasers were switched off.*Remedy"
+        ):
+            rig.lasers[0].open_gate()
+        assert not emulated.bench.board.lines & 7
+    with rig, gate_open(rig.lasers[0]):
+        assert emulated.bench.light() == [0]
 
 
 def test_a_full_disk_ends_the_log_and_nothing_else(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
