@@ -240,7 +240,6 @@ class OmicronLaser:
             answer = self._once("LOn")
         except NoAnswer:  # not sent again: the status says whether it was understood
             log.warning("%s: the answer to LOn was lost; asking for the status instead", self.name)
-            self._resynchronise()
             answer = ">"
         if answer.startswith("x"):
             self._refuse("refused to emit")
@@ -324,7 +323,6 @@ class OmicronLaser:
                 answer = self._once("SLP", f"{level:03X}")
             except NoAnswer as error:
                 log.warning("%s; asking for the level instead", error.without_remedy)
-                self._resynchronise()
                 continue
             if answer.startswith("x"):
                 self._refuse(f"refused ?SLP{level:03X}")
