@@ -228,9 +228,8 @@ def main() -> int:
         def told_to_end(number: int, frame: FrameType | None) -> None:
             program.guard_told = True  # and nothing is interrupted by it
 
-        signal.signal(signal.SIGTERM, told_to_end)
-        for ignored in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):  # are for the program, whose end is seen here
-            signal.signal(ignored, signal.SIG_IGN)
+        for number in ENDING:  # in a session of its own, it gets none that is for the program
+            signal.signal(number, told_to_end)
         if not guard(url, baud, host, program):
             return UNCONFIRMED
         return OFF_AS_STOPPED if program.was_stopped else IS_OFF

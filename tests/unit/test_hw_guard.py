@@ -150,10 +150,11 @@ def test_a_guard_that_is_killed_or_stopped_is_noticed_and_the_laser_goes_off(
     assert laser.said[-1] == "GAS"
 
 
-def test_a_guard_that_is_told_to_end_switches_off_first(laser: Laser, link: Link) -> None:
+@pytest.mark.parametrize("number", sorted(guard.ENDING), ids=lambda n: n.name)
+def test_a_guard_that_is_told_to_end_switches_off_first(laser: Laser, link: Link, number: signal.Signals) -> None:
     link.write(b"?LOn\r")
     wait(laser, on=True)
-    os.kill(guards_of(os.getpid())[0], signal.SIGTERM)
+    os.kill(guards_of(os.getpid())[0], number)
     wait(laser, on=False)
     with pytest.raises(SwitchedOff, match="its guard has closed it"):
         link.require_guard()

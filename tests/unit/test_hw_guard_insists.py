@@ -94,8 +94,10 @@ def test_a_cable_that_comes_back_within_ten_minutes_brings_the_switching_off(
 
 def test_a_port_that_its_last_guard_still_holds_is_waited_for(laser: Laser, ports: Callable[[Laser], Serial]) -> None:
     held = serial.Serial(laser.port, exclusive=True)
-    threading.Timer(0.5, held.close).start()
+    until = threading.Timer(0.5, held.close)
+    until.start()
     assert ports(laser).is_open
+    until.join()
     with pytest.raises(serial.SerialException, match="exclusively"):
         serial.Serial(laser.port, exclusive=True)  # and nobody else has it meanwhile
 
@@ -119,7 +121,13 @@ def test_what_the_laser_says_reaches_a_program_that_reads_slowly(
 
 @pytest.mark.parametrize(
     ("line", "is_stopped"),
-    [("7 (python) T 1", True), ("7 (python) t 1", True), ("7 (a) b T) S 1", False), ("7 (python) R 1", False)],
+    [
+        ("7 (python) T 1", True),
+        ("7 (python) t 1", True),
+        ("7 (a) b) T 1", True),
+        ("7 (a T b) S 1", False),
+        ("7 (python) R 1", False),
+    ],
 )
 def test_the_state_of_a_process_is_read_whatever_it_is_called(
     monkeypatch: pytest.MonkeyPatch, line: str, is_stopped: bool

@@ -292,5 +292,7 @@ def test_no_failure_of_a_step_keeps_the_rig_from_being_made_safe() -> None:
     rig = emulated.serial_rig()
     rig.__enter__()
     rig.devices().board.shut_now = full  # type: ignore[method-assign]
-    rig.make_safe()
+    rig.cut()  # says so, and goes on to the lasers
     assert not any(head.on_since for head in emulated.bench.heads)
+    rig.make_safe()
+    assert emulated.bench.board.lines == 0 and not rig.connected
