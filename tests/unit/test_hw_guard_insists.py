@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import serial
-from guard_fakes import Laser, guards_of, wait
+from guard_fakes import LIMIT_S, Laser, guards_of, wait
 
 from hw import guard
 from hw.clock import WallClock
@@ -189,3 +189,30 @@ def test_a_program_is_told_that_its_laser_has_not_confirmed(lasers: Callable[...
     with pytest.raises(SwitchedOff, match=r"laser 635 nm is closed: .*HAS NOT CONFIRMED THAT IT IS OFF.*Remedy"):
         link.require_guard()
     link.close()
+
+
+def test_closing_is_heard_though_a_child_has_a_copy_of_the_socket(
+    laser: Laser, ports: Callable[[Laser], Serial]
+) -> None:
+    port = ports(laser)
+    port.write(b"?LOn\r")
+    wait(laser, on=True)
+    copy = os.dup(port._open_host().fileno())  # what a child that was forked would hold
+    try:
+        begun = time.monotonic()
+        port.close()
+        assert laser.went_off - begun < LIMIT_S and not laser.on
+    finally:
+        os.close(copy)
+
+
+def test_closing_a_port_whose_guard_was_killed_switches_off(laser: Laser, ports: Callable[[Laser], Serial]) -> None:
+    """Though nobody had asked after the guard before."""
+    port = ports(laser)
+    port.write(b"?LOn\r")
+    wait(laser, on=True)
+    (own,) = guards_of(port=laser.port)
+    os.kill(own, signal.SIGKILL)
+    os.waitid(os.P_PID, own, os.WEXITED | os.WNOWAIT)
+    port.close()
+    wait(laser, on=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -161,6 +162,29 @@ def test_no_script_lights_a_laser_that_was_not_armed(make: str, tmp_path: Path) 
         pytest.raises(Unplugged, match="NOBODY"),
     ):
         rig.__enter__()
+
+
+@pytest.mark.parametrize(
+    ("counts", "limits", "says"),
+    [
+        (1023, (0.1, 5.0), r"gives 20.00 mW at the photodiode instead of 10 mW \(the converter is at its top\)"),
+        (768, (0.1, 1.5), r"gives 15.01 mW at the photodiode instead of 10 mW\. Remedy"),
+        (51, (0.1, 1.5), r"gives 1.00 mW at the photodiode instead of 10 mW\. Remedy"),
+        (767, (0.1, 1.5), None),
+        (52, (0.1, 1.5), None),
+    ],
+)
+def test_the_photodiodes_limits(counts: int, limits: tuple[float, float], says: str | None) -> None:
+    emulated = emulation()
+    rig = emulated.serial_rig()
+    rig.wiring = tuple(replace(wiring, limits=limits) for wiring in rig.wiring)
+    with rig, gate_open(rig.lasers[1]):
+        emulated.bench.board.sample = lambda pin: counts if pin == 1 else 0
+        if says is None:
+            assert rig.photodiode.read() == counts * rig.wiring[1].watts_per_count
+            return
+        with pytest.raises(DeviceFault, match=says):
+            rig.photodiode.read()
 
 
 def test_the_photodiode_is_compared_with_the_set_point() -> None:
