@@ -140,8 +140,8 @@ class Trial:
     off_ms: float | None
 
 
-def watched(numbers: Sequence[int]) -> list[Trial]:
-    """The trials of one lane, one after the other."""
+def watched(numbers: Sequence[int]) -> tuple[list[Trial], list[str]]:
+    """The trials of one lane, one after the other, and what their bench saw that must never happen."""
     omicron_firmware.EMISSION_S = 0.05
     emulation = emulated_devices(RIG, seed=1)
     context = multiprocessing.get_context("forkserver")
@@ -160,7 +160,7 @@ def watched(numbers: Sequence[int]) -> list[Trial]:
             if EVENTS[number % len(EVENTS)] == "connect":
                 with Server(lasers, None) as sockets:
                     trials.append(Trial("connect", _connected(context, emulation, sockets.urls, number)))
-    return trials
+    return trials, emulation.bench.hazards
 
 
 def _captured(context: Any, emulation: Emulation, folder: Path, event: str, number: int) -> float | None:
@@ -236,7 +236,8 @@ def run(quick: bool) -> dict[str, Any]:
     count = len(EVENTS) * (2 if quick else 29)
     lanes = [range(lane, count, LANES) for lane in range(LANES)]
     with ProcessPoolExecutor(LANES, mp_context=multiprocessing.get_context("spawn")) as pool:
-        trials = [trial for lane in pool.map(watched, lanes) for trial in lane]
+        seen = list(pool.map(watched, lanes))
+    trials = [trial for lane, _ in seen for trial in lane]
     times = [t.off_ms for t in trials if t.off_ms is not None]
     rows = []
     for event in EVENTS:
@@ -252,5 +253,6 @@ def run(quick: bool) -> dict[str, Any]:
         "worst_off_ms": max(times, default=0.0),
         "missed": len(trials) - len(times),
         "over_limit": sum(t > 1e3 * LIMIT_S for t in times),
+        "hazards": [hazard for _, found in seen for hazard in found],
         "rows": rows,
     }

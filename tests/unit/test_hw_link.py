@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import string
 from collections.abc import Callable
 from pathlib import Path
@@ -49,6 +50,19 @@ def test_unplugging_is_noticed_by_reading_and_by_writing() -> None:
             use(link)
         link.close()
         link.close()
+
+
+def test_two_programs_cannot_speak_to_one_device() -> None:
+    master, slave = os.openpty()
+    try:
+        first = Link(os.ttyname(slave), 9600, "turntable", VirtualClock())
+        with pytest.raises(Unplugged, match="turntable cannot be opened .*exclusively lock"):
+            Link(os.ttyname(slave), 9600, "turntable", VirtualClock())
+        first.close()
+        Link(os.ttyname(slave), 9600, "turntable", VirtualClock()).close()
+    finally:
+        os.close(master)
+        os.close(slave)
 
 
 def test_waiting_ends_at_the_limit_and_no_earlier() -> None:

@@ -11,7 +11,7 @@ from serial_fakes import BoardBench, LaserBench, TableBench
 from disco_twin.firmware.omicron import LaserHead, OmicronFirmware
 from disco_twin.firmware.wire import Fault, after, broken_by, garbled, late, lost, split
 from hw.devices.omicron import OmicronLaser
-from hw.devices.omicron_protocol import Status
+from hw.devices.omicron_protocol import Mode, Status
 from hw.errors import DeviceError, DeviceFault, DeviceRefused, Garbled, NoAnswer, Unplugged, WrongDevice
 
 
@@ -318,9 +318,13 @@ def test_nonsense_for_ever_ends_in_one_line() -> None:
         laser.measured_mw()
 
 
-def test_a_failed_step_of_switching_off_does_not_stop_the_others() -> None:
+@pytest.mark.parametrize("deaf", [b"LOf", b"TPP", b"SAS", b"SOM"])
+def test_a_failed_step_of_switching_off_does_not_stop_the_others(deaf: bytes) -> None:
+    """Each thing that could bring light back is gone by two of the steps, or by a step that has nothing else to do."""
     bench = LaserBench()
     laser = emitting(bench)
+    bench.head.mode |= int(Mode.AUTOSTART)
+    bench.head.stored_mode = bench.head.mode
 
     @dataclass
     class Deaf:
@@ -331,10 +335,22 @@ def test_a_failed_step_of_switching_off_does_not_stop_the_others() -> None:
         def __call__(self, data: bytes) -> bytes:
             return b"" if self.letters in data else data
 
-    bench.line.command_faults.extend([Deaf(b"LOf")] * 100)
-    with pytest.raises(DeviceError, match="LOf"):
+    bench.line.command_faults.extend([Deaf(deaf)] * 100)
+    with pytest.raises(DeviceError, match=deaf.decode()):
         laser.force_off()
-    assert bench.head.emission(bench.now()) == 0.0  # power and release went through
+    assert bench.head.emission(bench.now()) == 0.0
+    assert (bench.head.on_since is None) == (deaf != b"LOf")
+    assert (bench.head.level == 0.0) == (deaf != b"TPP")
+    assert not bench.head.stored_mode & Mode.AUTOSTART
+    assert bool(bench.head.stored_mode & Mode.RELEASE) == (deaf == b"SOM")
+
+
+def test_nothing_but_commands_drives_the_laser_once_it_is_connected() -> None:
+    """Its digital and analogue inputs are no gates: what hangs on them may not modulate the light."""
+    inputs = Mode.DIGITAL | Mode.ANALOG | Mode.ADHOC
+    bench = LaserBench(head=LaserHead(532.0, 100.0, stored_mode=int(inputs | Mode.APC)))
+    laser = emitting(bench)
+    assert not laser.mode() & inputs and laser.mode() & Mode.APC
 
 
 def test_unplug_and_replug() -> None:

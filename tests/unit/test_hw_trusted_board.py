@@ -1,0 +1,135 @@
+"""What the rig believes of its mirror board, and when it stops believing it: resets, slow and lost answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from test_rig_safety import at_message, emulation, reset
+
+from hw.clock import VirtualClock
+from hw.errors import DeviceFault, DeviceRefused, Refused
+from hw.trusted_board import TrustedBoard
+
+
+class FakeBoard:
+    """Writes down what it is told. `befall`: what happens to the next pattern that opens a gate."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self.clock, self.told, self.pattern = clock, list[str](), 0
+        self.befall: list[Callable[[], None]] = []
+        self.lost: Callable[[], None] = lambda: None
+
+    def when_lost(self, action: Callable[[], None]) -> None:
+        self.lost = action
+
+    def set_mirrors(self, u: int, v: int) -> None:
+        self.told.append(f"aim {u} {v}")
+
+    def set_lines(self, pattern: int) -> None:
+        self.told.append(f"lines {pattern}")
+        if pattern and self.befall:
+            self.befall.pop(0)()
+        self.pattern = pattern
+
+    def lines(self) -> int:
+        return self.pattern
+
+    def shut_now(self) -> None:
+        self.told.append("shut now")
+
+    def shut(self) -> None:
+        self.told.append("shut")
+
+    def counts(self, pin: int) -> int:
+        return pin
+
+    def close(self) -> None: ...
+
+
+def trusted() -> tuple[TrustedBoard, FakeBoard, list[str]]:
+    clock = VirtualClock()
+    fake, cuts = FakeBoard(clock), list[str]()
+    board = TrustedBoard(fake, clock, [0, 1], lambda: cuts.append("cut"))
+    board.aim(7, 8)
+    fake.told.clear()
+    return board, fake, cuts
+
+
+def test_a_gate_that_did_not_answer_is_told_to_shut_and_opened_again_after_aiming_anew() -> None:
+    board, fake, cuts = trusted()
+    fake.befall = [lambda: fake.lost()]  # the driver asks what to do before it repeats anything
+    board.open_gate(0)
+    assert fake.told == ["lines 1", "shut now", "lines 0", "aim 7 8", "lines 1"]
+    assert cuts == [] and board.lit(0)
+
+
+def test_an_opening_that_came_slowly_is_not_trusted() -> None:
+    board, fake, _ = trusted()
+    fake.befall = [lambda: fake.clock.sleep(0.16)]
+    board.open_gate(1)
+    assert fake.told == ["lines 2", "lines 0", "aim 7 8", "lines 2"]
+
+
+def test_a_board_that_never_answers_promptly_is_given_up() -> None:
+    board, fake, _ = trusted()
+    fake.befall = [lambda: fake.clock.sleep(0.16)] * 9
+    with pytest.raises(DeviceFault, match=r"did not open a gate promptly in 3 attempts.*Remedy"):
+        board.open_gate(1)
+    assert fake.told[-1] == "lines 0" and not board.lit(1)
+
+
+def test_an_answer_that_is_lost_with_a_gate_open_cuts_every_light_and_without_one_does_not() -> None:
+    board, fake, cuts = trusted()
+    fake.lost()
+    assert cuts == []
+    board.open_gate(0)
+    fake.lost()
+    assert cuts == ["cut"]
+
+
+def test_a_reset_in_an_exposure_is_called_a_reset() -> None:
+    """Not a laser that gives nothing, which it looks like at the photodiode."""
+    emulated = emulation()
+    with emulated.serial_rig() as rig:
+        rig.lasers[0].open_gate()
+        reset(emulated)
+        with pytest.raises(DeviceFault, match="it was reset"):
+            rig.photodiode.read()
+
+
+def test_a_reset_behind_any_slow_answer_makes_the_mirrors_be_aimed_anew() -> None:
+    """The floodlight's command is lost in a reset, and given again: witness high, mirrors elsewhere."""
+    emulated = emulation()
+    with emulated.serial_rig() as rig:
+        rig.projector.move(1900, 2000)
+        at_message(emulated, lambda data, n: data[:4] == b"\0\0\0\x01" and data[4] & 32 > 0, lambda: reset(emulated))
+        rig.floodlight.on()
+        rig.floodlight.off()
+        rig.lasers[0].open_gate()
+        assert [galvo.target for galvo in emulated.bench.board.galvos] == [1900, 2000]
+        rig.lasers[0].close_gate()
+    assert emulated.bench.hazards == []
+
+
+def test_a_gate_that_may_be_open_counts_as_open() -> None:
+    emulated = emulation()
+    with emulated.serial_rig() as rig:
+        board = rig.devices().board
+        refuse, works = DeviceRefused("board", "the mirror board", "does not follow", "none"), board.set_lines
+
+        def refused(pattern: int) -> None:
+            works(pattern)
+            raise refuse
+
+        board.set_lines = refused  # type: ignore[method-assign]
+        with pytest.raises(DeviceRefused):
+            rig.lasers[2].open_gate()
+        assert emulated.bench.light() == [2]
+        for move in (lambda: rig.turntable.move(np.pi), lambda: rig.projector.move(1, 2), rig.lasers[0].open_gate):
+            with pytest.raises(Refused, match="gate of laser 2 is open"):
+                move()
+        board.set_lines = works  # type: ignore[method-assign]
+        rig.lasers[2].close_gate()
+        assert emulated.bench.light() == [] and rig.open_gate == -1
