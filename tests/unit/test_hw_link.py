@@ -56,13 +56,41 @@ def test_two_programs_cannot_speak_to_one_device() -> None:
     master, slave = os.openpty()
     try:
         first = Link(os.ttyname(slave), 9600, "turntable", VirtualClock())
-        with pytest.raises(Unplugged, match="turntable cannot be opened .*exclusively lock"):
+        with pytest.raises(Unplugged, match=r"turntable cannot be opened .*exclusively lock"):
             Link(os.ttyname(slave), 9600, "turntable", VirtualClock())
         first.close()
         Link(os.ttyname(slave), 9600, "turntable", VirtualClock()).close()
     finally:
         os.close(master)
         os.close(slave)
+
+
+def test_what_was_heard_is_what_came_since_the_last_question() -> None:
+    """For errors about other devices: an older answer would accuse the wrong one."""
+    bench = LaserBench()
+    link = bench.link("laser")
+    assert link.heard() == "nothing answered"
+    link.write(b"?GSN\r")
+    while link.read(0.1):
+        pass
+    assert link.heard() == repr(b"!GSN4711\r") + " came"
+    link.write(b"silence")
+    link.read(0.1)
+    assert link.heard() == "nothing answered"
+
+
+def test_closing_never_raises_and_ends_the_log(tmp_path: Path) -> None:
+    """A cable that was pulled: what fails in closing is written down, and stops no other device from being closed."""
+    link = LaserBench(log=tmp_path / "laser.log").link("laser")
+
+    def fails() -> None:
+        raise OSError(5, "input/output error")
+
+    link._port.close = fails  # type: ignore[method-assign]
+    link.close()
+    link.close()
+    noted = (tmp_path / "laser.log").read_text().splitlines()
+    assert [line.split()[1] for line in noted[1:]] == ["open", "!", "close"]
 
 
 def test_waiting_ends_at_the_limit_and_no_earlier() -> None:

@@ -82,6 +82,96 @@ def test_no_light_before_it_is_armed_and_told_to_emit() -> None:
     assert bench.head.emission(bench.now()) == 0.0
 
 
+def test_switched_off_it_has_to_be_armed_again() -> None:
+    laser = emitting(LaserBench())
+    laser.force_off()
+    with pytest.raises(DeviceRefused, match="is not armed"):
+        laser.emit()
+
+
+def test_emission_is_waited_for_until_the_laser_measures_it() -> None:
+    """A laser may say that it is on before its diode gives light."""
+    bench = LaserBench()
+    laser = bench.connect()
+    laser.arm(40.0)
+    shines, from_s = bench.head.emission, bench.now() + 5.0
+    bench.head.emission = lambda now: shines(now) if now > from_s else 0.0  # type: ignore[method-assign]
+    laser.emit()
+    assert from_s < bench.now() < from_s + 0.3 and laser.measured_mw() == pytest.approx(40.0)
+
+
+def test_the_power_may_be_off_by_its_tolerance_and_no_more() -> None:
+    bench = LaserBench()
+    laser = emitting(bench)
+    for level, allowed in ((0.44, True), (0.4401, False), (0.36, True), (0.3599, False)):
+        bench.head.level = level
+        if allowed:
+            assert laser.require_power(0.1) == pytest.approx(100.0 * level)
+            continue
+        with pytest.raises(DeviceFault, match=r"emits (44\.01|35\.99) mW instead of 40 mW \(allowed: 10 % off\)"):
+            laser.require_power(0.1)
+
+
+def test_a_mode_that_is_not_kept_is_refused() -> None:
+    bench = LaserBench()
+    laser = bench.connect()
+    bench.line.command_faults.extend([lambda data: b"?SOM0008\r" if data.startswith(b"?SOM") else data] * 100)
+    with pytest.raises(DeviceRefused, match=r"did not keep mode 0018.*Remedy"):
+        laser.arm(40.0)
+    with pytest.raises(DeviceRefused, match="is not armed"):
+        laser.emit()
+
+
+def test_one_garbled_failure_bit_stops_nothing() -> None:
+    bench = LaserBench()
+    laser = emitting(bench)
+    bench.line.answer_faults.append(lambda data: [(0.0, data.replace(b"0000", b"0200"))])
+    assert laser.faults() == []
+    bench.head.fail(1 << 9)
+    assert laser.faults() == ["the interlock is open"]
+
+
+def test_a_reset_leaves_it_off_and_to_be_armed_again() -> None:
+    """Its memory may hold what switches it on: a reset brings that back."""
+    bench = LaserBench()
+    laser = emitting(bench)
+    bench.head.stored_level, bench.head.stored_mode = 0xFFF, int(Mode.BIAS | Mode.RELEASE | Mode.AUTOSTART)
+    laser.reset()
+    assert not bench.head.mode & (Mode.BIAS | Mode.RELEASE | Mode.AUTOSTART) and bench.head.level == 0.0
+    with pytest.raises(DeviceRefused, match="is not armed"):
+        laser.emit()
+
+
+def test_a_laser_that_never_emits_is_given_up() -> None:
+    bench = LaserBench()
+    laser = bench.connect()
+    laser.arm(40.0)
+    bench.head.emission = lambda now: 0.0  # type: ignore[method-assign]
+    begun = bench.now()
+    with pytest.raises(NoAnswer, match=r"did not emit within 8 s\. Remedy: check key switch, interlock and enable pin"):
+        laser.emit()
+    assert 8.0 <= bench.now() - begun < 8.5
+
+
+def test_arming_powers_a_laser_that_sleeps() -> None:
+    bench = LaserBench()
+    laser = bench.connect()
+    assert laser.ask("POf") == ">"
+    laser.arm(40.0)
+    laser.emit()
+    assert laser.measured_mw() == pytest.approx(40.0)
+
+
+def test_the_port_of_a_laser_that_does_not_answer_is_given_back() -> None:
+    bench, closed = LaserBench(), list[bool]()
+    laser = bench.connect()
+    bench.line.on_closed = lambda: closed.append(True)
+    bench.line.answer_faults.extend([lost] * 99)
+    with pytest.raises(NoAnswer):
+        laser.close()
+    assert closed == [True]
+
+
 @pytest.mark.parametrize("power", [-1.0, 0.0, 100.1, float("nan")])
 def test_powers_that_the_laser_does_not_have_are_refused(power: float) -> None:
     with pytest.raises(DeviceRefused, match="ask for more than 0 and at most 100 mW"):
