@@ -216,3 +216,14 @@ def test_closing_a_port_whose_guard_was_killed_switches_off(laser: Laser, ports:
     os.waitid(os.P_PID, own, os.WEXITED | os.WNOWAIT)
     port.close()
     wait(laser, on=False)
+
+
+def test_a_link_whose_guard_has_switched_off_says_that_and_not_that_a_cable_is_out(link: Link) -> None:
+    """The rig takes the first for granted when it is made safe, and reports the second."""
+    port = link._port
+    assert isinstance(port, Serial)
+    port.trip()
+    with pytest.raises(SwitchedOff, match="the port of laser 635 nm"):
+        link.write(b"?GAS\r")
+    with pytest.raises(SwitchedOff, match="the port of laser 635 nm"):
+        link.read(0.5)

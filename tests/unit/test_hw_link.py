@@ -79,6 +79,20 @@ def test_what_was_heard_is_what_came_since_the_last_question() -> None:
     assert link.heard() == "nothing answered"
 
 
+def test_what_came_before_a_command_is_no_part_of_its_answer() -> None:
+    bench = LaserBench()
+    inbox: Inbox[str] = Inbox(bench.link("meter"), LineFramer())
+    bench.line.say(b"old\r\n*1.2")
+    bench.clock.sleep(1.0)
+    inbox.clear()
+    bench.line.say(b"3E-3\r\n")
+    assert inbox.next(lambda _: True, 1.0) == "3E-3"
+    bench.line.say(b"one\r\ntwo\r\n")
+    assert inbox.next(lambda _: True, 1.0) == "one"
+    inbox.clear()
+    assert inbox.next(lambda _: True, 0.1) is None
+
+
 def test_closing_never_raises_and_ends_the_log(tmp_path: Path) -> None:
     """A cable that was pulled: what fails in closing is written down, and stops no other device from being closed."""
     link = LaserBench(log=tmp_path / "laser.log").link("laser")

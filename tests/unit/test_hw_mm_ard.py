@@ -11,7 +11,7 @@ from serial_fakes import BoardBench, LaserBench, TableBench
 
 from disco_twin.firmware.mm_ard import MirrorHead, MmArdFirmware
 from disco_twin.firmware.wire import Fault, after, garbled, late, lost, split
-from hw.devices.mm_ard import BOOT_S, FORGET_S, MirrorBoard
+from hw.devices.mm_ard import ADC_TOP, BOOT_S, FORGET_S, MirrorBoard
 from hw.errors import DeviceRefused, Garbled, InputError, NoAnswer, Unplugged, WrongDevice
 
 
@@ -32,6 +32,19 @@ def test_connecting_waits_for_the_board_and_shuts_its_lines() -> None:
     assert BOOT_S <= bench.now() < BOOT_S + 0.2
     assert bench.head.lines == 0
     assert not bench.head.blanking
+
+
+def test_a_board_that_opening_does_not_reset_is_shut_and_leaves_its_blanking_mode() -> None:
+    """A terminal does not reset it; in blanking mode lines follow a trigger input that nothing is plugged into."""
+    bench = BoardBench()
+    bench.line.firmware.opened = lambda now: None  # type: ignore[method-assign]
+    bench.head.set_pattern(0b111)
+    board = bench.connect()
+    assert bench.head.lines == 0
+    bench.head.blanking = bench.head.blank_on_high = True
+    board = bench.connect()
+    board.set_lines(0b10)
+    assert not bench.head.blanking and bench.head.lines == 0b10
 
 
 @pytest.mark.parametrize("make", [LaserBench, TableBench])
@@ -67,6 +80,11 @@ def test_lines_and_converter() -> None:
         board.set_lines(pattern)
         assert bench.head.lines == board.lines() == pattern
     assert [board.counts(pin) for pin in range(6)] == [1023, 1022, 1021, 1020, 1019, 1018]
+
+
+def test_a_reading_beyond_the_converters_range_is_its_top() -> None:
+    bench = BoardBench(head=MirrorHead(sample=lambda pin: 0x7FFF))
+    assert bench.connect().counts(0) == ADC_TOP
 
 
 def test_what_does_not_exist_is_refused_before_it_is_sent() -> None:
