@@ -93,6 +93,25 @@ def test_what_came_before_a_command_is_no_part_of_its_answer() -> None:
     assert inbox.next(lambda _: True, 0.1) is None
 
 
+def test_draining_drops_everything_and_gives_up_on_a_device_that_never_falls_silent() -> None:
+    bench, framer = LaserBench(), OmicronFramer()
+    inbox: Inbox[str] = Inbox(bench.link("laser"), framer)
+    bench.line.say(b"$note\r!one\r!two\r!thr")
+    assert inbox.next(lambda _: True, 1.0) == "!one"
+    assert inbox.drain(0.5)
+    bench.line.say(b"ee\r")
+    assert inbox.next(lambda _: True, 0.5) is None  # neither what was waiting nor the rest of what had begun
+    bench.line.say(b"$unasked\r")
+    bench.clock.sleep(1.0)
+    inbox.clear()
+    assert framer.notices == ["note", "unasked"]  # what the laser says unasked is kept until it is taken
+    for k in range(200):
+        bench.line._send([(0.1 * k, b"x")], bench.now())
+    begun = bench.now()
+    assert not inbox.drain(0.5)
+    assert 5.0 <= bench.now() - begun < 5.7
+
+
 def test_closing_never_raises_and_ends_the_log(tmp_path: Path) -> None:
     """A cable that was pulled: what fails in closing is written down, and stops no other device from being closed."""
     link = LaserBench(log=tmp_path / "laser.log").link("laser")
