@@ -1,16 +1,22 @@
 """What each part of the calibration costs: the same capture reconstructed with parts of the calibration made true.
 
-`disco-twin score --budget`. The truth goes to the pipeline here on purpose, into folders of the twin's own, and into no
-score of the run.
+`disco-twin score --budget`. Poses and projector are measured in one frame at each turntable angle, that of the scan as
+its silhouettes were understood, which stands turned against the object. Where one of the two is made true, the other
+keeps its relation to the cameras: otherwise beams and images would not meet on the object, which is no error of either.
+The truth goes to the pipeline here on purpose, into folders of the twin's own, and into no score of the run.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from disco_twin.camera.lens import Glare
 from disco_twin.deviation import ActualRig, actual_rig
@@ -18,7 +24,7 @@ from disco_twin.folder import RunFolder, write_atomically
 from disco_twin.pipeline_process import reconstruct_apart
 from disco_twin.world import World
 from hw.errors import InputError
-from pipeline.calibrate.calibration import Calibration, nominal_calibration, pair, pose_rows
+from pipeline.calibrate.calibration import Calibration, ProjectorCalibration, nominal_calibration, pair, pose_rows
 from pipeline.rig import RigConfig
 
 FORMAT_VERSION = 1
@@ -84,11 +90,30 @@ def _photometric(own: Calibration, true: Calibration) -> Calibration:
 def _pose(own: Calibration, true: Calibration) -> Calibration:
     pairs = zip(own.views, true.views, strict=True)
     views = tuple(t.model_copy(update={"radiance_factor": v.radiance_factor}) for v, t in pairs)
-    return own.model_copy(update={"views": views})
+    return own.model_copy(update={"views": views, "projectors": _seen_from(own.projectors, _frames(true, own))})
 
 
 def _projector(own: Calibration, true: Calibration) -> Calibration:
-    return own.model_copy(update={"projectors": true.projectors})
+    return own.model_copy(update={"projectors": _seen_from(true.projectors, _frames(own, true))})
+
+
+def _frames(here: Calibration, there: Calibration) -> list[NDArray[np.float64]]:
+    """Per turntable angle, (4, 4) one calibration's object frame -> another's: a rotation, the mean of the views."""
+    frames = []
+    for j in range(here.n_angles):
+        a, b = ([np.array(c.views[v].object_to_camera)[:3, :3] for v in c.views_at(j)] for c in (here, there))
+        turned = np.eye(4)
+        turned[:3, :3] = Rotation.from_matrix([y.T @ x for x, y in zip(a, b, strict=True)]).mean().as_matrix()
+        frames.append(turned)
+    return frames
+
+
+def _seen_from(
+    projectors: Sequence[ProjectorCalibration], frames: Sequence[NDArray[np.float64]]
+) -> tuple[ProjectorCalibration, ...]:
+    """The projectors in other frames, given the (4, 4) transform from each to theirs."""
+    poses = [pose_rows(np.array(p.object_to_projector) @ f) for p, f in zip(projectors, frames, strict=True)]
+    return tuple(p.model_copy(update={"object_to_projector": x}) for p, x in zip(projectors, poses, strict=True))
 
 
 VARIANTS: dict[str, Callable[[Calibration, Calibration], Calibration]] = {

@@ -32,10 +32,7 @@ UNDETERMINED_RAD, UNDETERMINED_MM = np.deg2rad(1.0), 5.0  # a direction that is 
 COARSE_STEPS, FINE_STEPS, EXACT_STEPS = 25, 5, 2
 HUBER_COARSE_PX, HUBER_FINE_PX = 3.0, 0.15
 SECTORS = 24  # per view: errors of the edges within one are taken as dependent
-COMMON_EDGE_PX, PATCHES = (
-    0.003,
-    8,
-)  # edges of a camera may be off together: by this, and as much as that many patches are
+COMMON_EDGE_PX = 0.003  # edges of a camera may be off together by this
 LENS = 4  # focal, centre x, y, k1
 HELD = 1e-7  # pixels: a lens does not follow the silhouettes
 
@@ -278,8 +275,7 @@ def _fine(
     meat = scores.T @ scores * count / max(count - sweep.size, count / 4)
     for c in range(len(sweep.lenses)):
         common = sector // (SECTORS * len(sweep.angles)) == c
-        together = np.hypot(COMMON_EDGE_PX, np.sqrt(variance / PATCHES))
-        push = j[common].T @ weight[common] * (together / variance)
+        push = j[common].T @ weight[common] * (COMMON_EDGE_PX / variance)
         meat += np.outer(push, push)
     surface, push = surface_error(j, rest - j @ step, weight / variance, length, place, inverse)
     meat += push

@@ -15,7 +15,7 @@ F64 = NDArray[np.float64]
 LENGTH_MM = 10.0  # over which a scanner errs alike, a Gaussian correlation (thesis 4.4)
 NEAR_MM = 2.0  # places that are nearer share an edge's own error
 MOST_EDGES = 1200
-LEAST_FREEDOM = 4.0
+LEAST_FREEDOM = 4.0  # with fewer, the patches' variance is not told from zero
 
 
 def surface_error(j: F64, rest: F64, weight: F64, length: F64, place: F64, inverse: F64) -> tuple[float, F64]:
@@ -46,6 +46,7 @@ def surface_error(j: F64, rest: F64, weight: F64, length: F64, place: F64, inver
     common = max(common, 0.0)
     form = to_variance[1, 0] * forms[0] + to_variance[1, 1] * forms[1]
     spread = form @ (max(own, 0.0) * kinds[0] + common * kinds[1])
-    freedom = max(common**2 / max(float((spread * spread.T).sum()), 1e-300), LEAST_FREEDOM)
+    freedom = common**2 / max(float((spread * spread.T).sum()), 1e-300)
+    student = freedom / (freedom - 2.0) if freedom > LEAST_FREEDOM else 1.0
     push = j.T @ (weight[:, None] * alike * weight) @ j
-    return float(np.sqrt(common)), common * freedom / (freedom - 2.0) * push
+    return float(np.sqrt(common)), common * student * push
