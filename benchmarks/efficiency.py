@@ -1,12 +1,13 @@
 """Efficiency of the estimators of R_d and of spot images, per decade below the peak: 1 / (variance x time).
 
-R_d: columns of the true R_d of `quick` and of a ball of 60 mm with a dark vein, without splitting and with weight
-windows of growing effort. Images: one spot of `quick` seen by one camera at one pixel a vertex's footprint, by exits
-alone, lobe connections, lobe connections with windows, and stock `volpath` that starts at the camera and connects to a
-spot light at the boundary. The truth of each is a long run with windows (and lobe connections) of its own photons.
+R_d: columns of the true R_d of `quick` and of a ball of 60 mm with a dark vein, by the analogue walk (no splitting, one
+majorant for all) and with weight windows of growing effort (and local majorants where they save time). Images: one spot
+of `quick` seen by one camera at one pixel a vertex's footprint, by exits alone, lobe connections, lobe connections with
+windows, and stock `volpath` that starts at the camera and connects to a spot light at the boundary. The truth of each
+is a long run with windows (and lobe connections) of its own photons.
 
 The variance is that of 16 replicates, relative to the truth's square, averaged over the entries of a decade; seconds
-are the processor's, all threads', since other programs share the machine.
+are the processor's, all threads', since other programs share the machine. Every point of a curve is measured.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 
 REPLICATES, DECADES, LASER = 16, 5, 0
-EFFORTS = (1.25, 3.0, 30.0)
+EFFORTS = (1.1, 3.0, 30.0, 100.0)
+SHARES = (1 / 16, 1 / 4, 1.0)  # of the walks, the points of a curve; ratios are those of the last
 SCENE = Path(__file__).parents[1] / "scenes" / "quick.toml"
 
 
@@ -53,12 +55,48 @@ def efficiency(quick: bool) -> dict[str, Any]:
     figures["curves"] += curves("spot image", rows)
     figures |= gains([r for r in rows if r.name in ("volpath", "lobes", "lobes, effort 1.25")], "volpath", "")
     figures |= gains([r for r in rows if r.name in ("exits", "lobes", "lobes, effort 1.25")], "exits", "")
+    figures |= cameras(quick)
     return figures
+
+
+def cameras(quick: bool) -> dict[str, Any]:
+    """`seconds_24_cameras_over_one`: processor time of the same spot's walks, by turns."""
+    from disco_twin.light.sources import BeamSource
+    from disco_twin.light.transport import Transport
+    from disco_twin.object.build import build_object
+    from disco_twin.scene import load_scene
+    from pipeline.calibrate.camera import PinholeCamera, look_at
+
+    transport = Transport(build_object(load_scene(SCENE, faults=False)))
+    ring = []
+    for k in range(24):
+        place = 470.0 * np.array([np.cos(k * np.pi / 12), np.sin(k * np.pi / 12), 0.45]) / np.hypot(1.0, 0.45)
+        pose = look_at(tuple(place), (0.0, 0.0, 0.0))
+        ring.append(PinholeCamera(192, 124, np.full(2, 62.0 / 0.044), np.array([96.0, 62.0]), np.zeros(5), pose))
+    origin = np.array([[590.0, 60.0, 110.0]])
+    axis = -origin / np.linalg.norm(origin)
+
+    def seconds(views: list[PinholeCamera], walks: int, seed: int) -> float:
+        start = time.process_time()
+        transport.trace(
+            lambda group: BeamSource(origin, axis, 1.0, np.ones((1, len(group)))), 1, walks, seed=seed, cameras=views
+        )
+        return time.process_time() - start
+
+    walks = 100_000 if quick else 400_000
+    ratios = []
+    for turn in range(6):  # the first compiles
+        one, many = (seconds(views, walks, turn) for views in (ring[:1], ring))
+        ratios.append(many / one)
+    return {
+        f"seconds_24_cameras_over_one{tail}": float(pick(ratios[1:]))
+        for tail, pick in (("", np.median), ("_min", np.min), ("_max", np.max))
+    }
 
 
 def gains(rows: Sequence[Measured], base: str, tail: str) -> dict[str, Any]:
     """Efficiency over the estimator `base`, per setting and decade; how uneven its relative errors are."""
-    of = {row.name: row for row in rows}
+    of = {row.name: row for row in rows}  # the last of a name, that with the most walks
     ratio = {n: by_decade(r.efficiency / of[base].efficiency) for n, r in of.items() if n != base}
     even = {n: float(np.sqrt(np.nanmax(r.variance) / np.nanmin(r.variance))) for n, r in of.items()}
     first = "effort 3" if "effort 3" in ratio else "lobes"
@@ -74,18 +112,14 @@ def by_decade(values: F64) -> dict[str, float]:
 
 
 def curves(title: str, rows: Sequence[Measured]) -> list[dict[str, Any]]:
-    """Error against seconds: the first point is measured, the others follow from error ~ seconds^-1/2."""
-    found = []
+    """Error against seconds, a line for each estimator and decade."""
+    found: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         for d, variance in enumerate(row.variance):
-            points = []
-            for k in (1, 10, 100):
-                settings = {"walks": row.walks * k, "measured": k == 1}
-                error = float(np.sqrt(variance / k))
-                points.append({"seconds": row.seconds * k, "error": error, "settings": settings})
             if np.isfinite(variance):
-                found.append({"name": f"{title}: {row.name}, decade {-d}", "points": points})
-    return found
+                point = {"seconds": row.seconds, "error": float(np.sqrt(variance)), "settings": {"walks": row.walks}}
+                found.setdefault(f"{title}: {row.name}, decade {-d}", []).append(point)
+    return [{"name": name, "points": points} for name, points in found.items()]
 
 
 def per_decade(samples: F64, truth: F64) -> F64:
@@ -100,16 +134,20 @@ def per_decade(samples: F64, truth: F64) -> F64:
     return np.array(found)
 
 
-def measured(name: str, walks: int, run: Callable[[int, int], F64], truth: F64, seed: int = 500) -> Measured:
-    """Run `run(walks, seed)`, which returns (REPLICATES, columns, entries), once to compile and once by the clock."""
+def measured(name: str, walks: int, run: Callable[[int, int], F64], truth: F64, seed: int = 500) -> Iterator[Measured]:
+    """Run `run(walks, seed)`, which returns (REPLICATES, columns, entries), once to compile, then by the clock with
+    growing numbers of walks.
+    """
     run(max(1, walks // 50), 1)
-    start = time.process_time()
-    samples = run(walks, seed)
-    seconds = time.process_time() - start
-    variances = [per_decade(samples[:, k], truth[k]) for k in range(len(truth))]
-    known = np.isfinite(variances)
-    mean = np.where(known, variances, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    return Measured(name, walks, seconds / REPLICATES / len(truth), np.where(known.any(axis=0), mean, np.nan))
+    for share in SHARES:
+        count = max(1, round(walks * share))
+        start = time.process_time()
+        samples = run(count, seed)
+        seconds = time.process_time() - start
+        variances = [per_decade(samples[:, k], truth[k]) for k in range(len(truth))]
+        known = np.isfinite(variances)
+        mean = np.where(known, variances, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+        yield Measured(name, count, seconds / REPLICATES / len(truth), np.where(known.any(axis=0), mean, np.nan))
 
 
 def objects(quick: bool) -> Iterator[tuple[str, Any, Any, list[int]]]:
@@ -152,7 +190,7 @@ def columns_of(obj: Any, basis: Any, columns: Sequence[int], quick: bool) -> Ite
     from disco_twin.light.transport import Transport
     from disco_twin.light.truth import hat_areas
 
-    transport = Transport(obj)
+    transport, plain = Transport(obj), Transport(obj, local=False)
     area = hat_areas(transport, basis)
     hats = np.tile(basis[:, columns].toarray().T, (REPLICATES, 1))
     entries = (hats @ transport.vertices) / hats.sum(axis=1, keepdims=True)
@@ -164,18 +202,19 @@ def columns_of(obj: Any, basis: Any, columns: Sequence[int], quick: bool) -> Ite
         split = None if effort is None else Splitting(entries, effort)
 
         def made(walks: int, seed: int) -> F64:
-            traced = transport.trace(source, len(hats), walks, seed=seed, deposit=True, split=split)
+            own = plain if effort is None else transport
+            traced = own.trace(source, len(hats), walks, seed=seed, deposit=True, split=split)
             assert traced.deposits is not None
             found = traced.deposits[:, LASER] @ basis / area
             return np.asarray(found.reshape(REPLICATES, len(columns), -1))
 
         return made
 
-    scale = 1 if quick else 5
+    scale = 2 if quick else 10
     truth = run(10.0)(1000 * scale, 9).mean(axis=0)
-    yield measured("analogue", 2000 * scale, run(None), truth)
+    yield from measured("analogue", 2000 * scale, run(None), truth)
     for effort in EFFORTS:
-        yield measured(f"effort {effort:g}", max(20, int(600 * scale / effort)), run(effort), truth)
+        yield from measured(f"effort {effort:g}", max(20, int(1800 * scale / effort)), run(effort), truth)
 
 
 def images(quick: bool) -> Iterator[Measured]:
@@ -217,10 +256,12 @@ def images(quick: bool) -> Iterator[Measured]:
 
     scale = 1 if quick else 5
     truth = run("lobes", 3.0)(1500 * scale, 9).mean(axis=0)
-    yield measured("exits", 4000 * scale, run("exits", None), truth)
-    yield measured("lobes", 2000 * scale, run("lobes", None), truth)
+    yield from measured("exits", 4000 * scale, run("exits", None), truth)
+    yield from measured("lobes", 2000 * scale, run("lobes", None), truth)
     for effort in (1.25, 3.0):
-        yield measured(f"lobes, effort {effort:g}", max(20, int(1000 * scale / effort)), run("lobes", effort), truth)
+        yield from measured(
+            f"lobes, effort {effort:g}", max(20, int(1000 * scale / effort)), run("lobes", effort), truth
+        )
     with tempfile.TemporaryDirectory() as folder:
         angle = float(np.degrees(np.arctan(radius / (np.linalg.norm(origin) - 17.0))))
         beam = {
@@ -234,4 +275,4 @@ def images(quick: bool) -> Iterator[Measured]:
             image = np.stack(made)[..., 0].reshape(REPLICATES, 1, -1).astype(float)
             return np.asarray(image * (truth.sum() / image.mean(axis=0).sum()))  # 1 W instead of 1 W/sr
 
-        yield measured("volpath", 4 * scale, volpath, truth)
+        yield from measured("volpath", 4 * scale, volpath, truth)

@@ -11,7 +11,7 @@ ENDING = re.compile(r"^(.*): (.*), decade (-?\d)$")
 
 
 def plot(record: Path, picture: Path) -> None:
-    """One row of panels for each quantity, one panel for each decade, one line an estimator; dots are measured."""
+    """One row of panels for each quantity, one panel for each decade, one line an estimator."""
     import matplotlib
 
     matplotlib.use("svg")
@@ -32,7 +32,7 @@ def plot(record: Path, picture: Path) -> None:
             panel.set_axis_off()
         for panel, (decade, estimators) in zip(row, sorted(decades.items(), reverse=True), strict=False):
             for estimator, points in estimators.items():
-                panel.loglog(*zip(*points, strict=True), label=estimator, linewidth=1.0, marker="o", markevery=[0])
+                panel.loglog(*zip(*points, strict=True), label=estimator, linewidth=1.0, marker="o", markersize=2.5)
             panel.set_title(f"{title}, decade {decade}", fontsize=8)
             panel.set_xlabel("processor seconds", fontsize=7)
             panel.set_ylabel("relative error", fontsize=7)

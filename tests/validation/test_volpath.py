@@ -7,6 +7,7 @@ one, volpath is wrong (it caps survival at .95 on every iteration).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -72,21 +73,33 @@ CASES = [
 
 @pytest.mark.parametrize(("boundary", "heterogeneous", "kind"), CASES)
 def test_agrees_with_stock_volpath(boundary: Boundary, heterogeneous: bool, kind: str, tmp_path: Path) -> None:
-    """Expected: the same radiance in every 4 x 4 block, surface reflection included, within both sides' noise."""
+    """Expected: the same radiance in every 4 x 4 block, surface reflection included, within both sides' noise; so too
+    the light from below the surface alone, which is volpath's image less that of the same object, black inside.
+    """
     obj, camera = bumpy(boundary, heterogeneous), camera_of()
     light = Uniform() if kind == "uniform" else Directional(direction=(-0.7, 0.5, -0.5))
     transport = Transport(obj)
     passes = 16
-    theirs = blocks(volpath_images(obj, camera, light, tmp_path, passes, 128 if kind == "uniform" else 192))
-    traced = [
-        render_reference(transport, light, [camera], 2 * 150_000, seed)[0].halves.sum(axis=1)[:, 0]
-        for seed in range(passes // 2)
+    spp = 128 if kind == "uniform" else 192
+    theirs = blocks(volpath_images(obj, camera, light, tmp_path, passes, spp))
+    layers = [
+        render_reference(transport, light, [camera], 2 * 150_000, s)[0].halves[:, :, 0] for s in range(passes // 2)
     ]
-    ours = blocks(np.concatenate(traced).astype(np.float64))
+    below, reflected = np.moveaxis(blocks(np.concatenate(layers).astype(np.float64)), 1, 0)
+    ours = below + reflected
     seen = (ours > 0).all(axis=0) & (theirs > 0).all(axis=0)  # not the background
     assert seen.sum() >= 12
     assert_z(z_of_difference(ours[:, seen], theirs[:, seen]), "blocks")
     assert_z(z_of_difference(ours.mean(axis=1), theirs.mean(axis=1)), "whole image")
+    black = replace(obj.medium, sigma_t=obj.medium.sigma_t * 100, albedo=obj.medium.albedo * 0)
+    shine = blocks(volpath_images(replace(obj, medium=black), camera, light, tmp_path, passes, spp))
+    assert_z(z_of_difference(below[:, seen], (theirs - shine)[:, seen]), "light from below the surface")
+    if boundary.kind == "matched":
+        assert not shine.any()
+        assert not reflected.any()
+    else:
+        shiny = (shine > 0).sum(axis=0) > passes // 2
+        assert_z(z_of_difference(reflected[:, seen & shiny], shine[:, seen & shiny]), "light reflected at the surface")
 
 
 @pytest.mark.slow
