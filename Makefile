@@ -57,7 +57,7 @@ picture: $(READY)
 	$(BIN)/python -m disco_twin.picture $(OUT) docs/picture.png
 
 curves: $(READY)
-	$(BIN)/python -m benchmarks walk --quick --json docs/benchmarks/walk.json
+	$(BIN)/python -m benchmarks walk --json docs/benchmarks/walk.json
 	$(BIN)/python -m benchmarks.plot docs/benchmarks/walk.json docs/benchmarks/walk.svg
 
 clean:
