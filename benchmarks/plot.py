@@ -16,7 +16,7 @@ def plot(record: Path, picture: Path) -> None:
 
     matplotlib.use("svg")
     matplotlib.rcParams |= {"svg.hashsalt": "disco-twin", "svg.fonttype": "none"}
-    from matplotlib import pyplot
+    from matplotlib import pyplot, ticker
 
     found: dict[str, dict[int, dict[str, list[tuple[float, float]]]]] = {}
     for curve in json.loads(record.read_text())["curves"]:
@@ -26,7 +26,9 @@ def plot(record: Path, picture: Path) -> None:
             points = [(p["seconds"], p["error"]) for p in curve["points"]]
             found.setdefault(title, {}).setdefault(decade, {})[estimator] = points
     columns = max(len(decades) for decades in found.values())
-    figure, axes = pyplot.subplots(len(found), columns, figsize=(3 * columns, 2.8 * len(found)), squeeze=False)
+    figure, axes = pyplot.subplots(
+        len(found), columns, figsize=(3 * columns, 2.8 * len(found)), squeeze=False, sharex="row", sharey="row"
+    )
     for row, (title, decades) in zip(axes, found.items(), strict=True):
         for panel in row[len(decades) :]:
             panel.set_axis_off()
@@ -37,6 +39,8 @@ def plot(record: Path, picture: Path) -> None:
             panel.set_xlabel("processor seconds", fontsize=7)
             panel.set_ylabel("relative error", fontsize=7)
             panel.tick_params(labelsize=7)
+            panel.xaxis.set_minor_formatter(ticker.NullFormatter())
+            panel.yaxis.set_minor_formatter(ticker.NullFormatter())
         row[0].legend(fontsize=6)
     figure.tight_layout()
     figure.savefig(picture, metadata={"Date": None})
