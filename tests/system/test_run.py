@@ -80,7 +80,8 @@ def summary(run_folder: Path) -> dict[str, Any]:
 
 def test_summary_has_exactly_what_the_design_says(summary: dict[str, Any]) -> None:
     assert set(summary) == {
-        "format_version", "scene", "seed", "method", "stages", "capture", "relit", "reflectance", "left_out",
+        "format_version", "scene", "seed", "method", "stages", "capture", "calibration", "simulation_noise", "relit",
+        "reflectance", "left_out",
     }  # fmt: skip
     assert summary["format_version"] == 1
     assert (summary["scene"], summary["seed"], summary["method"]) == ("quick", 1, "default")
