@@ -42,9 +42,9 @@ class Lobe:
 
     @classmethod
     def of(cls, medium: Medium, alpha: float) -> Lobe:
-        """Five and twenty mean free paths, the narrower the smoother: docs/decisions/0010 and 0051."""
+        """Six and twenty mean free paths, the narrower the smoother: docs/decisions/0010 and 0051."""
         free_path = 1.0 / max(float(medium.sigma_t.mean()), 1e-9)
-        return cls(40.0 / max(alpha, 0.02), 5.0 * free_path, 20.0 * free_path)
+        return cls(40.0 / max(alpha, 0.02), 6.0 * free_path, 20.0 * free_path)
 
 
 @dataclass(frozen=True)
