@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.camera.sensor import expected_variance
+from disco_twin.light import MOST_CAMERAS
 from disco_twin.scene import Scene
 from pipeline.calibrate.camera import PinholeCamera
 
@@ -28,14 +29,15 @@ def splat(scene: Scene) -> float:
     boundary, g = scene.object.boundary, float(np.max(np.abs(scene.object.medium.g)))
     cameras = [PinholeCamera.from_config(c) for c in scene.rig.cameras]
     unit = max(float(c.focal.prod() / (c.position @ c.position)) for c in cameras)
-    return splat_share(None if boundary.kind == "matched" else boundary.alpha, g) * unit
+    share = splat_share(None if boundary.kind == "matched" else boundary.alpha, boundary.eta, g)
+    return share * unit * max(1.0, len(cameras) / MOST_CAMERAS)  # each of those that are drawn counts for several
 
 
-def splat_share(alpha: float | None, g: float) -> float:
-    """Splat in units of focal length^2 / distance^2 (pixels), of a rough boundary or of none, within a factor of two,
-    three at g = .8 (docs/decisions/0053).
+def splat_share(alpha: float | None, eta: float, g: float) -> float:
+    """Splat in units of focal length^2 / distance^2 (pixels), of a rough boundary or of none (alpha None): within a
+    factor of three for alpha of .05 to .5, eta up to 1.7 and g up to .8, of five beyond (docs/decisions/0053).
     """
-    base = 0.17 if alpha is None else 0.05 + 0.028 / max(alpha, 0.02)
+    base = 0.17 if alpha is None else (0.05 + 0.028 / max(alpha, 0.02)) * (1.3 / eta) ** 4
     return base / (1 - g)
 
 
@@ -49,16 +51,17 @@ def walks_below_camera(scene: Scene) -> float:
 
 
 def measured_noise(scene: Scene, responses: Path) -> dict[str, Any] | None:
-    """What the simulated spots' own variances say, over pixels that light reached; None without simulated spots.
+    """What the simulated spots' own variances say, over pixels that a walk reached; None without simulated spots.
 
     median_over_camera: of the standard deviations' ratio; above_camera: share of pixels where it exceeds one;
-    walks_below_camera: walks a spot that would bring it below one in 99 of 100 pixels.
+    walks_below_camera: walks a spot that would bring it below one in 99 of 100 of these pixels.
     """
     files = sorted(responses.glob("spots-*.npy"))
     if not files:
         return None
     sensor, ratios = lars3_sensor(scene.rig), []
-    for path in files[:: max(1, len(files) // FILES)][:FILES]:
+    for index in np.unique(np.linspace(0, len(files) - 1, FILES).round().astype(int)):
+        path = files[index]
         mean, variance = np.load(path, mmap_mode="r")
         for k, laser in enumerate(scene.rig.lasers):
             watts = laser.power_mw * 1e-3

@@ -48,7 +48,7 @@ def predict(world: World) -> list[tuple[str, str]]:
             "noise",
             f"of the simulation up to {math.sqrt(needed / work.walks_per_spot):.0f} times the camera's in a pixel with "
             f"{work.walks_per_spot} walks a spot; {needed:.1e} bring it below the camera's in every pixel (within a "
-            "factor of two); the spots' variance is kept pixel by pixel",
+            "factor of three); the spots' variance is kept pixel by pixel",
         )
     )
     lines += [("left out", f"{item['what']}: {item['because']}") for item in left_out_by_the_twin(world)]

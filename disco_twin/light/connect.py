@@ -13,11 +13,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from disco_twin.light import sampling
+from disco_twin.light import MOST_CAMERAS, sampling
 from disco_twin.light.sampling import Rng
 from disco_twin.light.tables import FAR, ROW, Cameras, Images, Tables, cell_index, medium_at
-
-MOST_CAMERAS = 6  # that one collision or exit connects to
 
 
 def drawn_camera(cams: Cameras, k: Any, rng: Rng) -> tuple[Any, float]:

@@ -92,8 +92,9 @@ def build_distance_field(mesh: trimesh.Trimesh, cells: int = 128) -> DistanceFie
     facing = np.einsum("nk,nk->n", away, normal[tuple(near.T)])
     near = near[(facing <= 0) | (steps[tuple(near.T)] < 2)]
     exact = distance_to(mesh, corner + (near[:, ::-1] + 0.5) * cell)
+    distance[tuple(near.T)] = exact
     # Single precision, here and where the walk looks up its cell.
-    distance[tuple(near.T)] = np.maximum(exact - 1e-5 * extent, 0.0)
+    distance = np.maximum(distance - 1e-5 * extent - 4e-7 * float(np.abs(mesh.bounds).max()), 0.0)
     for axis in range(3):
         for rim in (0, -1):
             np.moveaxis(distance, axis, 0)[rim] = 0.0  # a look-up outside the grid is clamped to its rim

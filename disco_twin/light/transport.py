@@ -42,7 +42,7 @@ class Lobe:
 
     @classmethod
     def of(cls, medium: Medium, alpha: float) -> Lobe:
-        """Six and twenty mean free paths, the narrower the smoother: docs/decisions/0010 and 0051."""
+        """Six and twenty mean free paths, the narrower the smoother: docs/decisions/0010."""
         free_path = 1.0 / max(float(medium.sigma_t.mean()), 1e-9)
         return cls(40.0 / max(alpha, 0.02), 6.0 * free_path, 20.0 * free_path)
 
@@ -94,6 +94,11 @@ class Transport:
         return build_distance_field(self.object.mesh, self._cells)
 
     @cached_property
+    def _distance(self) -> mi.Float:
+        """The distances alone, for wavelengths without local majorants."""
+        return to_float(self._field.distance)
+
+    @cached_property
     def _inside(self) -> NDArray[np.int64]:
         """(N, 3) indices [z, y, x] of cells of the distance field that lie in the object: every fourth per axis."""
         field = self._field
@@ -142,7 +147,7 @@ class Transport:
         packed[..., 1 : 1 + len(group)] = np.moveaxis(albedo, 0, -1)
         size = np.asarray(medium.high) - np.asarray(medium.low)
         local = self._local_majorants(sigma_t) if self._local and not homogeneous else None
-        field = self._field.distance if local is None else np.stack([self._field.distance, local.rate], axis=-1)
+        bounds = np.stack([self._field.distance, local.rate], axis=-1) if local is not None else None
         nz, ny, nx = sigma_t.shape
         g = float(medium.g[group[0]])
         return kernel.Tables(
@@ -154,7 +159,7 @@ class Transport:
             majorant=dr.opaque(mi.Float, majorant),
             local=local is not None,
             stretch=dr.opaque(mi.Float, local.stretch if local is not None else FAR),
-            distance=to_float(field),
+            distance=self._distance if bounds is None else to_float(bounds),
             medium=to_float(packed),
             albedo=weight_type(len(group))(*[dr.opaque(mi.Float, float(a.flat[0])) for a in albedo]),
             dims=mi.ScalarPoint3i(nx, ny, nz),

@@ -51,6 +51,8 @@ def test_more_light_in_a_splat_asks_for_more_walks(scene: Scene) -> None:
     smooth = scene.object.boundary.model_copy(update={"alpha": 0.05})
     smoother = scene.model_copy(update={"object": scene.object.model_copy(update={"boundary": smooth})})
     assert walks_below_camera(smoother) > 2 * walks
+    crowd = scene.model_copy(update={"rig": scene.rig.model_copy(update={"cameras": scene.rig.cameras * 12})})
+    assert walks_below_camera(crowd) == pytest.approx(4 * walks)
 
 
 def test_measured_noise_reads_the_variances(scene: Scene, tmp_path: Path) -> None:

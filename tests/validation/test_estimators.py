@@ -263,5 +263,23 @@ def test_a_walk_adds_a_splat_of_known_radiance(kind: str, alpha: float, g: float
         part = (mean <= mean.max() * 10.0**-decade) & (mean > mean.max() * 10.0 ** -(decade + 1))
         assert part.sum() >= 5
         share = variance[part].sum() * walks / mean[part].sum() / unit
-        expected = splat_share(alpha if kind == "rough" else None, g)
+        expected = splat_share(alpha if kind == "rough" else None, 1.3, g)
         assert 1 / within < share / expected < within, f"decade -{decade}: {share:.3f}"
+
+
+def test_a_camera_of_many_gets_larger_splats() -> None:
+    """Rationale: of many cameras six are drawn, and each counts for several; `plan` must know.
+
+    Expected behaviour: with 24 cameras the variance of a walk, over the mean, is 24 / 6 that with six, within a third.
+    """
+    views = [camera(VIEWS[0], 13.0, 24)] * 24
+    transport = Transport(bumpy(g=0.0), cells=64)
+    share = []
+    for count in (6, 24):
+        images = transport.trace(beam(64, **SPOT), 64, 3_000, seed=74, cameras=views[:count]).images  # type: ignore[arg-type]
+        assert images is not None
+        found = images[:, 0, :, 0].astype(float)
+        mean, variance = found.mean(axis=(0, 1)), found.var(axis=0, ddof=1).mean(axis=0)
+        bright = mean > mean.max() * 0.1
+        share.append(variance[bright].sum() / mean[bright].sum())
+    assert share[1] / share[0] == pytest.approx(4.0, rel=1 / 3)
