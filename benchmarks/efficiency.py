@@ -1,10 +1,10 @@
 """Efficiency of the estimators of R_d and of spot images, per decade below the peak: 1 / (variance x time).
 
-R_d: columns of the true R_d of `quick` and of a ball of 60 mm with a dark vein, by the analogue walk (no splitting, one
-majorant for all) and with weight windows of growing effort (and local majorants where they save time). Images: one spot
-of `quick` seen by one camera at one pixel a vertex's footprint, by exits alone, lobe connections, lobe connections with
-windows, and stock `volpath` that starts at the camera and connects to a spot light at the boundary. The truth of each
-is a long run with windows (and lobe connections) of its own photons.
+R_d: columns of the true R_d of `quick` and of a ball of 60 mm with a dark vein, by the analogue walk (no windows, one
+majorant for all; Russian roulette below a tenth of the power), with local majorants where they save time, and with
+weight windows of growing effort. Images: one spot of `quick` seen by one camera at one pixel a vertex's footprint, by
+exits alone, lobe connections, lobe connections with windows, and stock `volpath` that starts at the camera and connects
+to a spot light at the boundary. The truth of each is a long run with windows (and lobe connections) of its own photons.
 
 The variance is that of 16 replicates, relative to the truth's square, averaged over the entries of a decade; seconds
 are the processor's, all threads', since other programs share the machine. Every point of a curve is measured.
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 
 REPLICATES, DECADES, LASER = 16, 5, 0
-EFFORTS = (1.1, 3.0, 30.0, 100.0)
+EFFORTS = (1.1, 1.25, 3.0, 10.0, 30.0, 100.0)
 SHARES = (1 / 16, 1 / 4, 1.0)  # of the walks, the points of a curve; ratios are those of the last
 SCENE = Path(__file__).parents[1] / "scenes" / "quick.toml"
 
@@ -139,10 +139,10 @@ def measured(name: str, walks: int, run: Callable[[int, int], F64], truth: F64, 
     growing numbers of walks.
     """
     run(max(1, walks // 50), 1)
-    for share in SHARES:
+    for point, share in enumerate(SHARES):
         count = max(1, round(walks * share))
         start = time.process_time()
-        samples = run(count, seed)
+        samples = run(count, seed + point)
         seconds = time.process_time() - start
         variances = [per_decade(samples[:, k], truth[k]) for k in range(len(truth))]
         known = np.isfinite(variances)
@@ -198,12 +198,13 @@ def columns_of(obj: Any, basis: Any, columns: Sequence[int], quick: bool) -> Ite
     def source(group: Sequence[int]) -> HatSource:
         return HatSource(transport.vertices, transport.faces, hats, len(group))
 
-    def run(effort: float | None) -> Callable[[int, int], F64]:
+    def run(effort: float | None, local: bool = True) -> Callable[[int, int], F64]:
         split = None if effort is None else Splitting(entries, effort)
 
         def made(walks: int, seed: int) -> F64:
-            own = plain if effort is None else transport
-            traced = own.trace(source, len(hats), walks, seed=seed, deposit=True, split=split)
+            traced = (transport if local else plain).trace(
+                source, len(hats), walks, seed=seed, deposit=True, split=split
+            )
             assert traced.deposits is not None
             found = traced.deposits[:, LASER] @ basis / area
             return np.asarray(found.reshape(REPLICATES, len(columns), -1))
@@ -212,7 +213,9 @@ def columns_of(obj: Any, basis: Any, columns: Sequence[int], quick: bool) -> Ite
 
     scale = 2 if quick else 10
     truth = run(10.0)(1000 * scale, 9).mean(axis=0)
-    yield from measured("analogue", 2000 * scale, run(None), truth)
+    yield from measured("analogue", 2000 * scale, run(None, local=False), truth)
+    if transport.uses_local_majorants():
+        yield from measured("local majorants", 2000 * scale, run(None), truth)
     for effort in EFFORTS:
         yield from measured(f"effort {effort:g}", max(20, int(1800 * scale / effort)), run(effort), truth)
 

@@ -87,7 +87,7 @@ class Transport:
         self.scene = mesh_scene(self.vertices, self.faces, bsdfs[obj.boundary.kind])
         self._cells, self._local = cells, local
         self._diffusion: dict[int, Diffusion] = {}
-        self._tables_of: dict[tuple[int, ...], kernel.Tables] = {}
+        self._kept: dict[tuple[int, ...], kernel.Tables] = {}
 
     @cached_property
     def _field(self) -> DistanceField:
@@ -135,7 +135,17 @@ class Transport:
         low, high = np.asarray(medium.low, float), np.asarray(medium.high, float)
         return local_majorants(sigma_t, low, high, field.low, field.cell, field.cells, self._inside)
 
-    def _tables(self, group: Sequence[int]) -> kernel.Tables:
+    def uses_local_majorants(self) -> bool:
+        """Whether any wavelength's flights go by local majorants."""
+        return any(self._tables(group).local for group in self.groups)
+
+    def _tables(self, group: tuple[int, ...]) -> kernel.Tables:
+        """The walk's tables for a group of wavelengths, made once."""
+        if group not in self._kept:
+            self._kept[group] = self._make_tables(group)
+        return self._kept[group]
+
+    def _make_tables(self, group: tuple[int, ...]) -> kernel.Tables:
         medium = self.object.medium
         sigma_t = medium.sigma_t[group[0]].astype(np.float64)
         albedo = medium.albedo[list(group)].astype(np.float64)
@@ -232,9 +242,7 @@ class Transport:
         cameras: Sequence[PinholeCamera], layers: int, deposit: bool, first: int, lanes: int,
         split: Splitting | None,
     ) -> Traced:  # fmt: skip
-        if group not in self._tables_of:
-            self._tables_of[group] = self._tables(group)
-        tables = self._tables_of[group]
+        tables = self._tables(group)
         table = camera_table(cameras) if cameras else None
         per_tag = (
             8

@@ -10,7 +10,9 @@ import pytest
 from disco_twin.camera.lars3 import Lars3, lars3_sensor
 from disco_twin.camera.sensor import expected_variance
 from disco_twin.noise import RADIANCES, measured_noise, splat, walks_below_camera
+from disco_twin.predict import predict
 from disco_twin.scene import Scene, load_scene
+from disco_twin.world import World
 from hw.record import to_radiance
 from pipeline.calibrate.camera import PinholeCamera
 
@@ -53,6 +55,13 @@ def test_more_light_in_a_splat_asks_for_more_walks(scene: Scene) -> None:
     assert walks_below_camera(smoother) > 2 * walks
     crowd = scene.model_copy(update={"rig": scene.rig.model_copy(update={"cameras": scene.rig.cameras * 12})})
     assert walks_below_camera(crowd) == pytest.approx(4 * walks)
+
+
+def test_plan_says_how_many_walks(scene: Scene) -> None:
+    """Expected behaviour: the plan of the quick scene names its walks, and those that bury their noise."""
+    lines = dict(predict(World(scene)))
+    assert f"with {scene.simulation.walks_per_spot} walks a spot" in lines["noise"]
+    assert f"{walks_below_camera(scene):.1e} bring it below" in lines["noise"]
 
 
 def test_measured_noise_reads_the_variances(scene: Scene, tmp_path: Path) -> None:
