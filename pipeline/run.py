@@ -219,7 +219,16 @@ def calibrate(
 ) -> tuple[Calibration, dict[str, Any]]:
     """From the rig's own images where there are any, else nominal; and what the stages of a measurement found."""
     if given is not None:
-        return Calibration.load(given), {"source": "given"}
+        known = Calibration.load(given)
+        if rig.sensor.response == "curved" and not known.sensor.response:
+            raise InputError(
+                "the camera is not linear, and this calibration does not know its response",
+                file=given,
+                key="sensor.response",
+                value=list(known.sensor.response),
+                remedy="give a calibration of this camera, or none: it is then measured from the targets",
+            )
+        return known, {"source": "given"}
     if not has_targets(capture, rig):
         if rig.sensor.response == "curved":
             raise InputError(

@@ -154,6 +154,7 @@ def _plates(
     light: list[list[float]] = []
     reading: list[list[float]] = []
     place, points, steps = [], [], []
+    dark = 0
     beam_px = rig.projector.beam_diameter_mm * float(lens.focal.mean()) / next(iter(poses.values()))[2, 3]
     config = rig.cameras[[c.name for c in rig.cameras].index(targets.camera)]
     for i, pose in poses.items():
@@ -168,6 +169,9 @@ def _plates(
                 sums.append(float((radiance * area).sum(dtype=np.float64)) / share[laser])
                 watts.append(stream.meta(address).photodiode_w)
                 peaks.append(find_peak(radiance))
+            if not np.all(np.array(watts) > 0):  # a photodiode that reads nothing, or no number
+                dark += 1
+                continue
             if any(p.at_border for p in peaks) or not seen(peaks, np.array(watts), beam_px, 0.0).any():
                 continue
             light.append(sums)
@@ -175,8 +179,12 @@ def _plates(
             place.append(targets.placements[i].mount)
             points.append(_on_plane(lens, np.mean([p.pixel for p in peaks], axis=0), pose))
             steps.append((plan.spots[spot].u, plan.spots[spot].v))
+    if dark:
+        log.warning("%s: %d spots on the white plate are left out: the photodiode read nothing", targets.camera, dark)
     if len(points) < 4:
-        raise DiscoError(f"{targets.camera}: the white plate's spots are not seen. Remedy: check the plate's place")
+        why = f" (in {dark} of them the photodiode read nothing)" if dark else ""
+        remedy = "check the lasers and the photodiode" if dark else "check the plate's place"
+        raise DiscoError(f"{targets.camera}: the white plate's spots are not seen{why}. Remedy: {remedy}")
     white = balance(np.array(light).T, np.array(reading).T, np.ones(lasers), np.array(place))
     return white, np.array(points), np.array(steps, float)
 

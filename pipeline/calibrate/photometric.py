@@ -11,13 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from pipeline.calibrate.camera import PinholeCamera
 
 F64 = NDArray[np.float64]
-
-CHANCE = 1e-3  # that places differ as much by chance; if less probable, the plate's places count as the error
 
 
 @dataclass(frozen=True)
@@ -54,6 +51,11 @@ def balance(light: F64, reading: F64, share: F64, place: NDArray[np.int64]) -> B
     """light: (L, N) sums of radiance times area in W/sr; reading: (L, N) photodiode, W; share: (L,) of the plate.
 
     place: (N,) which exposures were made in one place of the plate; a plate's pose errs for all of them alike
+
+    Exposures of one place scatter by speckle; places differ by a variance of their own, alike for all lasers: what
+    their means differ by beyond that scatter (variance components, the moments of DerSimonian and Laird 1986). As
+    n + 1 places leave it n degrees of freedom, it counts n / (n - 2) times (Student); two or three places, for which
+    that does not exist, 5 and 4 times. One place tells nothing of it.
     """
     ratio = np.pi * light / (share[:, None] * reading)
     places, which, count = np.unique(place, return_inverse=True, return_counts=True)
@@ -61,9 +63,13 @@ def balance(light: F64, reading: F64, share: F64, place: NDArray[np.int64]) -> B
     rest = ratio / mean[:, which] - 1
     scatter = np.sqrt((rest**2).sum(axis=1) / max(rest.shape[1] - len(places), 1))
     value = ratio.mean(axis=1)
-    # Exposures of one place scatter by speckle alone; places differ by more only where a plate's pose is wrong.
-    freedom = len(value) * (len(places) - 1)
-    apart = float((count * ((mean / value[:, None] - 1) / scatter[:, None]) ** 2).sum())
-    excess = np.sqrt(apart / freedom) if freedom and apart > chi2.isf(CHANCE, freedom) else 1.0
+    freedom, number = len(places) - 1, ratio.shape[1]
+    by_place = float((count / number) @ (count / number))  # of the places' variance, what is left of it in the mean
+    common = 0.0
+    if freedom:
+        apart = (count * (mean / value[:, None] - 1) ** 2).sum(axis=1) - freedom * scatter**2
+        common = max(float(apart.mean()) / (number * (1.0 - by_place)), 0.0)
+    student = freedom / (freedom - 2.0) if freedom > 3 else 6.0 - freedom
+    error = np.sqrt(scatter**2 / number + student * common * by_place)
     drift = (light.max(axis=1) - light.min(axis=1)) / light.mean(axis=1)
-    return Balance(1.0 / value, scatter * excess / np.sqrt(ratio.shape[1]) / value, drift, scatter)
+    return Balance(1.0 / value, error / value, drift, scatter)

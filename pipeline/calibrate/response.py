@@ -27,6 +27,7 @@ FULL = 0.95  # of the full well: brighter ones may be clipped
 LEAST = 20  # observations between any two knots
 POWERS = np.linspace(1.0, 3.0, 9)  # of the gamma curve that the fit starts from
 STEPS = 30
+MODEL_CHI2, SIGMAS = 1.2, 5.0  # what a spline and a noise model may leave per degree of freedom; and chance beyond it
 
 
 @dataclass(frozen=True)
@@ -44,9 +45,22 @@ def fit_response(images: Sequence[NDArray[np.uint16]], seconds: Sequence[float],
     """images: (K, H, W) digital numbers of a still scene, each exposed for its time. The full well's charge stands for
     the largest digital number, the offset for none; dark current counts as light of the scene.
     """
+    if (
+        len(images) < 2
+        or len(images) != len(seconds)
+        or len({np.size(i) for i in images}) > 1
+        or not np.size(images[0])
+    ):
+        raise InputError(
+            "a bracket is two or more images of one size, each with its time",
+            key="bracket",
+            value=[np.size(i) for i in images],
+            remedy="take the bracket again",
+        )
     span = sensor.saturation_dn - sensor.offset_dn
     time = np.asarray(seconds, np.float64) / max(seconds)
     seen = (np.stack([np.ravel(i) for i in images], axis=1).astype(np.float64) - sensor.offset_dn) / span
+    _require_greys(seen)
     seen = seen[_spread(seen)]
     values, light = _start(seen, time)
     free = slice(1, len(KNOTS) - 1)  # none is nothing, and full is full: the scale is the white balance's
@@ -66,6 +80,9 @@ def fit_response(images: Sequence[NDArray[np.uint16]], seconds: Sequence[float],
             damping *= 10
     fit = _Equations.of(seen, time, values, light, sensor)
     _require_cover(time * light[:, None])
+    freedom = max(int((fit.weight > 0).sum()) - len(seen) - len(KNOTS) + 2, 1)
+    chi2 = fit.cost / freedom
+    _require_steady(chi2, freedom)
     covariance = np.linalg.inv(fit.reduced())
     dense = np.linspace(0, 1, 8 * TABLE) ** 2
     curve = CubicSpline(KNOTS, values, bc_type="natural")
@@ -74,7 +91,6 @@ def fit_response(images: Sequence[NDArray[np.uint16]], seconds: Sequence[float],
     basis = CubicSpline(KNOTS, np.eye(len(KNOTS)), bc_type="natural")(exposure)[:, free]
     spread = np.sqrt(np.einsum("ni,ij,nj->n", basis, covariance, basis))
     slope = np.maximum(curve(exposure, 1), 1e-6)
-    chi2 = fit.cost / max(int((fit.weight > 0).sum()) - len(seen) - len(KNOTS) + 2, 1)
     return Response(exposure, np.sqrt(max(chi2, 1.0)) * spread / slope, chi2)
 
 
@@ -121,7 +137,9 @@ class _Equations:
     def reduced(self, damping: float = 0.0) -> F64:
         """(M, M) information on the knots when the radiances are unknown."""
         own = np.maximum(self.own * (1 + damping), 1e-12)
-        shared = self.shared + damping * np.diag(np.diag(self.shared))
+        diagonal = np.diag(self.shared)
+        # A knot that no pixel shows stays where it is until `_require_cover` names it.
+        shared = self.shared + np.diag(damping * diagonal + np.where(diagonal > 0, 0.0, 1.0))
         return np.asarray(shared - (self.mixed / own[:, None]).T @ self.mixed)
 
     def solve(self, damping: float) -> tuple[F64, F64]:
@@ -130,6 +148,22 @@ class _Equations:
         right = self.right_shared - self.mixed.T @ (self.right_own / own)
         knots = np.asarray(np.linalg.solve(self.reduced(damping), right), np.float64)
         return knots, np.asarray((self.right_own - self.mixed @ knots) / own)
+
+
+def _require_steady(chi2: float, freedom: int) -> None:
+    """Refuse a bracket whose images do not fit one scene and one response; a lamp that flickers by 1 % does that.
+
+    Its error is one number for a whole image, which no number of pixels averages out and no covariance here contains.
+    """
+    most = MODEL_CHI2 + SIGMAS * float(np.sqrt(2.0 / freedom))
+    if not chi2 <= most:
+        raise InputError(
+            "the exposures do not fit one still scene under steady light",
+            key="bracket chi2",
+            value=round(float(chi2), 2),
+            allowed=f"up to {most:.2f}",
+            remedy="steady light (let the lamp warm up) and a still board; take the bracket again",
+        )
 
 
 def _spread(seen: F64) -> NDArray[np.int64]:
@@ -160,6 +194,19 @@ def _start(seen: F64, time: F64) -> tuple[F64, F64]:
     return values, light
 
 
+def _require_greys(seen: F64) -> None:
+    """Refuse a bracket in which hardly any pixel shows light that is not clipped in two exposures or more."""
+    told = int((((seen > 0.01) & (seen < FULL)).sum(axis=1) >= 2).sum())
+    if told < LEAST:
+        raise InputError(
+            f"the exposures do not cover the response: {told} of {len(seen)} pixels are neither dark nor clipped in "
+            "two of them",
+            key="bracket",
+            allowed=f"{LEAST} or more",
+            remedy="more light, a shorter sensor.longest_exposure_s or more sensor.steps; a board with black and white",
+        )
+
+
 def _require_cover(exposure: F64) -> None:
     """Refuse a bracket that leaves a part of the response open."""
     count = np.histogram(exposure[exposure < FULL], KNOTS[KNOTS < FULL])[0]
@@ -168,6 +215,6 @@ def _require_cover(exposure: F64) -> None:
         raise InputError(
             f"the exposures do not cover the response between {KNOTS[open_at]:.2g} and {KNOTS[open_at + 1]:.2g} of the "
             "full well",
-            key="seconds",
-            remedy="add longer and shorter exposures of a scene with more greys",
+            key="bracket",
+            remedy="raise sensor.steps or sensor.longest_exposure_s, or light the board more; take the bracket again",
         )

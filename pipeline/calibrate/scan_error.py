@@ -7,15 +7,19 @@ components). The fit takes a part of the errors for motion; the forms' expectati
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 
+log = logging.getLogger(__name__)
+
 LENGTH_MM = 10.0  # over which a scanner errs alike, a Gaussian correlation (thesis 4.4)
 NEAR_MM = 2.0  # places that are nearer share an edge's own error
 MOST_EDGES = 1200
-LEAST_FREEDOM = 4.0  # with fewer, the patches' variance is not told from zero
+LEAST_FREEDOM = 2.2  # with fewer the patches' variance is hardly known; Student's factor there is wide enough for all
 
 
 def surface_error(j: F64, rest: F64, weight: F64, length: F64, place: F64, inverse: F64) -> tuple[float, F64]:
@@ -25,6 +29,7 @@ def surface_error(j: F64, rest: F64, weight: F64, length: F64, place: F64, inver
     (K, 4) object frame, mm, and pixels per mm, inverse: (P, P) of the fit's precision.
 
     An error that is itself estimated, with n degrees of freedom, leaves Student's distribution: n / (n - 2) as wide.
+    Where no two edges are near but not adjacent, nothing is known of it: zeros, and a warning.
     """
     every = -(-len(rest) // MOST_EDGES)
     j, rest, length, place = j[::every], rest[::every], length[::every], place[::every]
@@ -41,12 +46,21 @@ def surface_error(j: F64, rest: F64, weight: F64, length: F64, place: F64, inver
     kinds = left(np.eye(len(rest))), left(alike)
     near = (apart > NEAR_MM) & (apart < LENGTH_MM)
     forms = np.diag(length), np.outer(length, length) * alike * near
+    if not near.any():
+        log.warning(
+            "no two edges of the silhouettes lie %g to %g mm apart: they do not tell how far the scan is off over "
+            "whole patches, and poses are stated without it",
+            NEAR_MM,
+            LENGTH_MM,
+        )
+        return 0.0, np.zeros_like(inverse)
     to_variance = np.linalg.inv([[float((form * kind).sum()) for kind in kinds] for form in forms])
     own, common = to_variance @ [float(rest @ form @ rest) for form in forms]
     common = max(common, 0.0)
     form = to_variance[1, 0] * forms[0] + to_variance[1, 1] * forms[1]
     spread = form @ (max(own, 0.0) * kinds[0] + common * kinds[1])
     freedom = common**2 / max(float((spread * spread.T).sum()), 1e-300)
-    student = freedom / (freedom - 2.0) if freedom > LEAST_FREEDOM else 1.0
+    freedom = max(freedom, LEAST_FREEDOM)
+    student = freedom / (freedom - 2.0)
     push = j.T @ (weight[:, None] * alike * weight) @ j
     return float(np.sqrt(common)), common * student * push

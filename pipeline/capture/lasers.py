@@ -7,6 +7,7 @@ from the laser. The table explains images and is no part of them: a capture is w
 from __future__ import annotations
 
 import logging
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -68,12 +69,16 @@ def read_lasers(folder: Path) -> list[LaserRow]:
 
 
 def drifts(rows: Sequence[LaserRow]) -> dict[int, float]:
-    """View -> the largest share by which any laser's own reading was off its first one; a view's last rows count."""
+    """View -> the largest share by which any laser's own reading was off its first one; a view's last rows count.
+
+    Infinite where a reading is no number, or the first one is not above zero.
+    """
     first: dict[int, float] = {}
     last: dict[tuple[int, int], float] = {}
     for row in rows:
         first.setdefault(row.laser, row.own_w)
-        last[row.view, row.laser] = abs(row.own_w / first[row.laser] - 1.0) if first[row.laser] > 0.0 else float("inf")
+        share = abs(row.own_w / first[row.laser] - 1.0) if first[row.laser] > 0.0 else math.inf
+        last[row.view, row.laser] = share if math.isfinite(share) else math.inf
     found: dict[int, float] = {}
     for (view, _), share in last.items():
         found[view] = max(found.get(view, 0.0), share)

@@ -42,6 +42,8 @@ from pipeline.calibrate.geometry import _outside, reconstruct_surface
 from pipeline.calibrate.intrinsics import find_corners, fit_intrinsics
 from pipeline.calibrate.pose import fit_poses
 from pipeline.calibrate.projector import TwoMirrorProjector
+from pipeline.capture.layout import ImageMeta
+from pipeline.capture.plan import ImageAddress
 from pipeline.capture.stream import StreamReader
 from pipeline.capture.targets import Targets
 from pipeline.rig import RigConfig
@@ -147,6 +149,22 @@ def test_photometric_slips_show(name: str, plates: Plates, monkeypatch: Patch) -
     factor, which, slip = PHOTOMETRIC[name]
     slip(monkeypatch)
     require_seen(lambda: plates.scores()[which], good[which], factor)
+
+
+@pytest.mark.parametrize("reading", [0.0, float("nan")])
+def test_a_photodiode_that_reads_nothing_is_named(reading: float, plates: Plates, monkeypatch: Patch) -> None:
+    """At the first exposure alone: that spot is left out. At all of them: one line."""
+    real, good = StreamReader.meta, plates.scores()[0]
+
+    def first(self: StreamReader, which: ImageAddress) -> ImageMeta:
+        dead = which == ImageAddress(which.view, "spot", 0, 0)
+        return replace(real(self, which), photodiode_w=reading) if dead else real(self, which)
+
+    monkeypatch.setattr(StreamReader, "meta", first)
+    assert plates.scores()[0] < 2 * good + 0.005
+    monkeypatch.setattr(StreamReader, "meta", lambda *a: replace(real(*a), photodiode_w=reading))
+    with pytest.raises(DiscoError, match=r"photodiode read nothing.*Remedy"):
+        plates.scores()
 
 
 # Intrinsics and distortion

@@ -23,6 +23,7 @@ from disco_twin.simulate import take_targets
 from disco_twin.world import World
 from hw.errors import InputError
 from hw.record import Sensor, to_radiance
+from pipeline.calibrate.calibration import nominal_calibration
 from pipeline.calibrate.measure import has_targets, measure_response
 from pipeline.calibrate.response import TABLE, Response, fit_response
 from pipeline.capture.loop import capture
@@ -42,13 +43,16 @@ CURVES: dict[str, Callable[[F64], F64]] = {
 }
 
 
-def bracket(curve: Callable[[F64], F64], seed: int, bits: int = 12) -> list[NDArray[np.uint16]]:
-    """Black, white and greys, with the noise of charge and of reading out."""
+def bracket(curve: Callable[[F64], F64], seed: int, bits: int = 12, flicker: float = 0.0) -> list[NDArray[np.uint16]]:
+    """Black, white and greys, with the noise of charge and of reading out; the lamp flickers by a share."""
     rng, well = np.random.default_rng(seed), SPAN * SENSOR.gain_e_per_dn
     light = np.where(rng.random(24_000) < 0.2, rng.uniform(0.04, 0.9, 24_000), rng.choice([0.04, 0.9], 24_000)) * 33
     images = []
     for seconds in SECONDS:
-        share = (rng.poisson(np.minimum(light * seconds * well, 1e9)) + 25 * rng.standard_normal(len(light))) / well
+        lamp = 1 + flicker * rng.standard_normal() if flicker else 1.0
+        share = (
+            rng.poisson(np.minimum(light * lamp * seconds * well, 1e9)) + 25 * rng.standard_normal(len(light))
+        ) / well
         number = np.rint(SENSOR.offset_dn + SPAN * np.sign(share) * curve(np.abs(share)))
         images.append(np.clip(number, 0, 4095).astype(np.uint16).reshape(120, 200) >> (12 - bits))
     return images
@@ -91,9 +95,9 @@ def test_a_broken_bracket_shows() -> None:
     ):
         try:
             found = broken()
-        except (InputError, np.linalg.LinAlgError):
+        except InputError:
             continue
-        assert share_off(found, curve).max() > 10 * good or found.chi2 > 10
+        assert share_off(found, curve).max() > 10 * good
 
 
 def test_opencvs_estimate_agrees_in_the_middle() -> None:
@@ -111,9 +115,36 @@ def test_opencvs_estimate_agrees_in_the_middle() -> None:
     assert np.abs(ratio / np.median(ratio) - 1).max() < 0.1
 
 
-def test_a_bracket_that_says_nothing_is_refused() -> None:
-    with pytest.raises(InputError, match=r"do not cover.*Remedy"):
-        fit_response([np.full((20, 20), 100, np.uint16)] * 3, [1.0, 2.0, 4.0], SENSOR)
+def test_a_bracket_under_an_unsteady_lamp_is_refused() -> None:
+    """Rationale: 2 % of flicker makes the response 10 % wrong while its covariance says .5 %. Expected: refused for its
+    chi2, in every one of six brackets; what is not refused at a quarter of that is right to 2 %.
+    """
+    for seed in range(6):
+        with pytest.raises(InputError, match=r"bracket chi2 = .*steady.*allowed: up to 1\.2.*Remedy: steady light"):
+            fit_response(bracket(gamma_curve, seed, flicker=0.02), SECONDS, SENSOR)
+        try:
+            found = fit_response(bracket(gamma_curve, seed, flicker=0.005), SECONDS, SENSOR)
+        except InputError:
+            continue
+        assert share_off(found, gamma_curve).max() < 0.02
+
+
+SIZE = (20, 30)
+SAYS_NOTHING = {
+    "one grey": ([np.full(SIZE, 100, np.uint16)] * 3, [1.0, 2.0, 4.0], "do not cover"),
+    "lens cap": ([np.full(SIZE, 64, np.uint16)] * 12, SECONDS, "do not cover"),
+    "all saturated": ([np.full(SIZE, 4095, np.uint16)] * 12, SECONDS, "do not cover"),
+    "unequal sizes": ([np.full(SIZE, 100, np.uint16), np.full((5, 4), 100, np.uint16)], [1.0, 0.5], "of one size"),
+    "a time too few": ([np.full(SIZE, 100, np.uint16)] * 3, [1.0, 0.5], "each with its time"),
+    "empty": ([], [], "two or more"),
+}
+
+
+@pytest.mark.parametrize("name", SAYS_NOTHING)
+def test_a_bracket_that_says_nothing_is_refused(name: str) -> None:
+    images, seconds, match = SAYS_NOTHING[name]
+    with pytest.raises(InputError, match=match + ".*Remedy"):
+        fit_response(images, seconds, SENSOR)
 
 
 def test_a_curved_camera_of_the_twin_means_radiance_after_its_bracket(tmp_path: Path) -> None:
@@ -155,6 +186,10 @@ def test_a_run_photographs_the_bracket_and_the_pipeline_asks_for_it(tmp_path: Pa
     assert not has_targets(folder.capture, rig)
     with pytest.raises(InputError, match=r"sensor\.response = .curved.*not linear.*Remedy"):
         calibrate(folder.capture, rig, lars3_sensor(rig), world.scan, None)
+    earlier = tmp_path / "earlier.json"
+    nominal_calibration(rig, lars3_sensor(rig)).save(earlier)
+    with pytest.raises(InputError, match=r"earlier\.json: sensor\.response.*not linear.*Remedy"):
+        calibrate(folder.capture, rig, lars3_sensor(rig), world.scan, earlier)
     stored = []
     for _ in range(2):
         take_targets(world, folder, lambda *_: None)

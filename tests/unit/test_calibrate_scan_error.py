@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from pipeline.calibrate.scan_error import LENGTH_MM, surface_error
 
@@ -41,3 +42,33 @@ def test_the_scans_error_and_what_it_does_are_known() -> None:
     assert max(white) < 0.005
     assert 0.8 < np.sqrt(np.mean(np.square(scores))) < 1.25
     assert np.std(scores, axis=0).min() > 0.6
+
+
+def test_what_is_hardly_known_has_a_wide_error() -> None:
+    """One outline has 3 degrees of freedom: wide enough all the same (.6 to 1.25; without Student's factor 1.7)."""
+    rng = np.random.default_rng(1)
+    place, j = (x[:120] for x in outlines())
+    apart = np.linalg.norm(place[:, None, :3] - place[None, :, :3], axis=2)
+    root = np.linalg.cholesky(np.exp(-((apart / 10.0) ** 2)) + 1e-9 * np.eye(120))
+    weight, inverse = np.full(120, 0.3**-2), np.linalg.inv(j.T @ j / 0.3**2)
+    scores = []
+    for _ in range(100):
+        error = 0.1 * SCALE * root @ rng.standard_normal(120) + 0.02 * rng.standard_normal(120)
+        step = inverse @ (j.T @ (weight * error))
+        size, push = surface_error(j, error - j @ step, weight, np.ones(120), place, inverse)
+        if size > 0:
+            scores.append(step / np.sqrt(np.diag(inverse @ push @ inverse)))
+    assert len(scores) > 90
+    assert 0.6 < np.sqrt(np.mean(np.square(scores))) < 1.25
+
+
+@pytest.mark.parametrize("larger", [1 / 36, 30.0])
+def test_edges_that_say_nothing_of_patches(larger: float, caplog: pytest.LogCaptureFixture) -> None:
+    """No two edges of a crumb, or of few edges on a large object, are near and not adjacent: nothing, and a warning."""
+    place, j = (x[:: 1 if larger < 1 else 6] for x in outlines())
+    place[:, :3] *= larger
+    weight, inverse = np.full(len(place), 0.3**-2), np.linalg.inv(j.T @ j / 0.3**2)
+    size, push = surface_error(j, 0.05 * np.ones(len(place)), weight, np.ones(len(place)), place, inverse)
+    assert size == 0.0
+    assert not push.any()
+    assert "apart" in caplog.text

@@ -13,7 +13,7 @@ from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.firmware.emulate import Emulation
 from hw.errors import DeviceFault, Refused
 from hw.interface import LaserReading, gate_open
-from pipeline.capture.lasers import LASERS, append_lasers, drifts, read_lasers
+from pipeline.capture.lasers import LASERS, LaserRow, append_lasers, drifts, read_lasers
 from pipeline.capture.loop import capture
 from pipeline.capture.quality import examine
 from pipeline.capture.stream import StreamReader
@@ -101,3 +101,8 @@ def test_the_table_of_readings_survives_a_crash_in_its_last_line(tmp_path: Path)
     assert max(r.view for r in read_lasers(tmp_path)) == 0
     assert read_lasers(tmp_path / "none") == []
     assert drifts(read_lasers(tmp_path))[0] == float("inf")  # a laser that began at nothing
+    later = LaserRow(2, 4.5, 0, 0.01, float("nan"), 0.0)
+    assert drifts([LaserRow(0, 1.5, 0, 0.01, 0.01, 0.0), later]) == {
+        0: 0.0,
+        2: float("inf"),
+    }  # no number is no drift of 0
