@@ -21,6 +21,7 @@ from hw.wiring import Devices, LaserWiring
 
 log = logging.getLogger(__name__)
 
+GUARDS_EVERY_S = 0.5  # while lasers warm up
 DARK_COUNTS = 8  # of the converter's 1023, with every gate shut
 
 
@@ -55,6 +56,7 @@ class SerialRig:
         self._warm_up_s, self._power_tolerance = warm_up_s, power_tolerance
         self._timebase: Timebase = Elapsed(clock) if timebase is None else timebase
         self._devices: Devices | None = None
+        self._closing: Devices | None = None  # what `make_safe` has not done with
         self._board: TrustedBoard | None = None
         self.last_open = -1  # the laser whose gate was opened last: whose photodiode is to be read
         self.lasers: Sequence[Laser] = [GatedLaser(self, i) for i in range(len(self.wiring))]
@@ -84,7 +86,7 @@ class SerialRig:
             for head, wiring in zip(devices.heads, self.wiring, strict=True):
                 head.arm(wiring.power_mw)
                 head.emit()
-            self.clock.sleep(self._warm_up_s)
+            self._warm_up()
             self.check()
         except BaseException:
             self.make_safe()
@@ -92,29 +94,38 @@ class SerialRig:
         self._timebase.restart()
         return self
 
+    def _warm_up(self) -> None:
+        """Wait, and end at once where a laser's guard ends."""
+        left = self._warm_up_s
+        while left > 0:
+            self.clock.sleep(min(left, GUARDS_EVERY_S))
+            left -= GUARDS_EVERY_S
+            self.require_guards()
+
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.make_safe()
 
     def make_safe(self) -> None:
-        """Gates shut, lasers and floodlight off, ports given back. Never raises; no device's failure stops another's.
+        """Gates shut, lasers and floodlight off, ports given back. No device's failure stops another's, or is raised.
 
         First every laser is told, which takes no time; then each device confirms in being closed, which one that has
-        fallen silent can draw out for seconds. The board is told in the first step of being closed.
+        fallen silent can draw out for seconds. The board is told in the first step of being closed. Ctrl-C ends one
+        step, which is tried again after the others, and is raised in the end; where it falls between steps, being
+        called again does the rest.
         """
-        devices, self._devices, self._board, self.last_open = self._devices, None, None, -1
+        self._closing = devices = self._devices or self._closing
+        self._devices, self._board, self.last_open = None, None, -1
         if devices is None:
             return
         told: list[Callable[[], None]] = [head.off_now for head in devices.heads]
         steps = [*told, devices.board.close, *(head.close for head in devices.heads), devices.table.close]
-        for step in steps:
-            try:
-                step()
-            except SwitchedOff as error:
-                log.info("making the rig safe: %s", error)  # its guard was faster, and speaks up if it fails
-            except Exception as error:  # noqa: BLE001 - the steps that follow matter more
-                log.error("making the rig safe: %s", error)
+        again, interruption = _each(steps)
+        _each(again)
+        self._closing = None
+        if interruption is not None:
+            raise interruption
 
     def cut(self) -> None:
         """Tell gates and lasers to go dark without waiting for answers; the rig must be entered anew then."""
@@ -200,3 +211,20 @@ class SerialRig:
         self.devices()
         if self.open_gate >= 0:
             raise Refused(f"the {what} must not move while the gate of laser {self.open_gate} is open")
+
+
+def _each(steps: Sequence[Callable[[], None]]) -> tuple[list[Callable[[], None]], BaseException | None]:
+    """Take every step, whatever the others raise. Which of them were interrupted, and by what."""
+    again: list[Callable[[], None]] = []
+    interruption: BaseException | None = None
+    for step in steps:
+        try:
+            step()
+        except SwitchedOff as error:
+            log.info("making the rig safe: %s", error)  # its guard was faster, and speaks up if it fails
+        except Exception as error:  # noqa: BLE001 - the steps that follow matter more
+            log.error("making the rig safe: %s", error)
+        except BaseException as error:  # noqa: BLE001 - raised when the other devices are off
+            again.append(step)
+            interruption = error
+    return again, interruption

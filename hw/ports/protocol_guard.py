@@ -91,6 +91,9 @@ class Serial(SerialBase):
                 said += self._host.recv(256)
         except OSError as error:
             said = str(error).encode()
+        except BaseException:  # Ctrl-C: a guard that is still counted would keep old signals for the next one
+            self._end()
+            raise
         if said != READY:
             self._end()
             raise SerialException(said.decode(errors="replace") or "the guard process did not start")
@@ -103,10 +106,14 @@ class Serial(SerialBase):
         environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(hw.__path__[0]).parent), *sys.path[1:]])}
         shared = [theirs.fileno(), _SIGNALS.reader()]
         command = [sys.executable, "-m", "hw.guard", url, str(self.baudrate), *map(str, shared), str(os.getpid())]
-        with theirs:
-            self._guard = subprocess.Popen(
-                command, pass_fds=shared, env=environment, stdin=subprocess.DEVNULL, start_new_session=True
-            )
+        try:
+            with theirs:
+                self._guard = subprocess.Popen(
+                    command, pass_fds=shared, env=environment, stdin=subprocess.DEVNULL, start_new_session=True
+                )
+        except BaseException:
+            ours.close()
+            raise
         return ours
 
     def gone(self, wait_s: float = ENDING_S) -> str | None:

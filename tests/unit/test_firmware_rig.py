@@ -137,12 +137,12 @@ def test_what_fails_while_lasers_warm_up_leaves_nothing_on(error: type[BaseExcep
     """Without the capture loop, which would make the rig safe once more."""
     emulated = emulation()
     rig, sleep = emulated.serial_rig(), emulated.clock.sleep
-    rig._warm_up_s = 60.0
+    rig._warm_up_s = 0.4375  # less than the guards are asked at
     lit = []
 
     def disturbed(seconds: float) -> None:
         sleep(seconds)
-        if seconds == 60.0:
+        if seconds == 0.4375:
             lit.append([head.on_since is not None for head in emulated.bench.heads])
             if error is KeyboardInterrupt:
                 raise KeyboardInterrupt

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import time
 from collections.abc import Callable
 
@@ -17,6 +18,7 @@ from guard_fakes import LIMIT_S, Laser, Run, guards_of, said_by, wait
 from hw import guard
 from hw.errors import SwitchedOff
 from hw.guard import GuardClosed
+from hw.ports import protocol_guard
 from hw.ports.protocol_guard import Serial
 from hw.serial_link import Link
 
@@ -217,6 +219,7 @@ def test_every_guard_sees_the_signal(lasers: Callable[..., Laser], run: Run) -> 
 
 THREE = """
 import signal, sys
+from hw.ports import protocol_guard
 from hw.ports.protocol_guard import Serial
 signal.signal(signal.SIGTERM, lambda *_: sys.exit())
 names = [sys.argv[1], *sys.argv[2].split(",")]
@@ -226,3 +229,30 @@ for port in ports:
 print("on", flush=True)
 sum(range(2 * 10**9))
 """
+
+
+def test_ctrl_c_while_a_guard_starts_leaves_none_counted(
+    laser: Laser, ports: Callable[[Laser], Serial], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A notebook goes on: with one guard too many, the next laser would be switched off by the signal of before."""
+    before = protocol_guard._SIGNALS.guards
+
+    def interrupted(self: socket.socket, size: int) -> bytes:
+        raise KeyboardInterrupt
+
+    started = []
+    start = Serial._start
+
+    class Interrupted(socket.socket):
+        recv = interrupted  # type: ignore[assignment]
+
+    def spied(self: Serial) -> socket.socket:
+        ours = start(self)
+        started.append(self._guard)
+        return Interrupted(fileno=ours.detach())
+
+    monkeypatch.setattr(Serial, "_start", spied)
+    with pytest.raises(KeyboardInterrupt):
+        ports(laser)
+    assert protocol_guard._SIGNALS.guards == before
+    assert started[0] is not None and started[0].poll() is not None  # ended, and waited for

@@ -320,3 +320,57 @@ def test_no_failure_of_a_step_keeps_the_rig_from_being_made_safe() -> None:
     assert not any(head.on_since for head in emulated.bench.heads)
     rig.make_safe()
     assert emulated.bench.board.lines == 0 and not rig.connected
+
+
+@pytest.mark.parametrize("step", ["off_now", "board", "head", "table"])
+def test_ctrl_c_while_the_rig_is_made_safe_leaves_no_device_open(step: str) -> None:
+    """It ends one step and comes out at the end; every device is closed. Called again, nothing is left."""
+    emulated = emulation()
+    rig = emulated.serial_rig()
+    rig.__enter__()
+    devices, closed = rig.devices(), []
+    parts = {"head": devices.heads[0], "board": devices.board, "table": devices.table}
+    for name, part in parts.items():
+        close = part.close
+
+        def spied(name: str = name, close: Callable[[], None] = close) -> None:
+            if step == name and not pressed:
+                pressed.append(name)
+                raise KeyboardInterrupt
+            close()
+            closed.append(name)
+
+        setattr(part, "close", spied)  # noqa: B010 - a spy on one device
+    pressed: list[str] = []
+    off_now = devices.heads[0].off_now
+
+    def off_spied() -> None:
+        if step == "off_now" and not pressed:
+            pressed.append(step)
+            raise KeyboardInterrupt
+        off_now()
+
+    setattr(devices.heads[0], "off_now", off_spied)  # noqa: B010 - the same
+    with pytest.raises(KeyboardInterrupt):
+        rig.make_safe()
+    assert sorted(closed) == ["board", "head", "table"]
+    assert emulated.bench.board.lines == 0 and not any(head.on_since for head in emulated.bench.heads)
+    rig.make_safe()
+    assert len(closed) == 3
+
+
+def test_a_guard_that_ends_while_lasers_warm_up_ends_it_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    emulated = emulation()
+    rig = emulated.serial_rig()
+    rig._warm_up_s = 3600.0
+    begun = emulated.clock.now()
+
+    def require_guards(self: SerialRig) -> None:
+        if emulated.clock.now() - begun > 100:
+            raise SwitchedOff("port", "laser", "its guard process was killed", "see to it")
+
+    monkeypatch.setattr(SerialRig, "require_guards", require_guards)
+    with pytest.raises(SwitchedOff), rig:
+        pass
+    assert emulated.clock.now() - begun < 110
+    assert emulated.bench.light() == [] and not any(head.on_since for head in emulated.bench.heads)
