@@ -33,6 +33,7 @@ from pipeline.calibrate.camera import PinholeCamera, turn
 from pipeline.calibrate.intrinsics import Intrinsics, board_pose, find_corners, fit_intrinsics
 from pipeline.calibrate.peaks import Peak, brightness, find_peak, footprint, seen
 from pipeline.calibrate.photometric import Balance, balance, pixel_areas
+from pipeline.calibrate.place import against_cameras, with_pose_error
 from pipeline.calibrate.pose import PoseFit, fit_poses
 from pipeline.calibrate.projector import TwoMirrorProjector
 from pipeline.calibrate.projector_fit import GATE, ProjectorFit, StepSize, projection, refine, step_size
@@ -89,8 +90,9 @@ def measure(capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh
     with StreamReader(capture) as stream:
         stream.require_complete()
         poses = measure_poses(stream, sensor, mesh, cameras, angles)
-        size = plane_measurement(rig, cameras, poses, angles)
-        fit = measure_projector(stream, rig, sensor, mesh, poses, size)
+        nominal, place = nominal_projector(rig, cameras, poses)
+        size = plane_measurement(cameras, poses, nominal)
+        fit = measure_projector(stream, rig, sensor, mesh, poses, size, nominal, place)
         watts = mean_power(stream)
     for text in poses.ambiguity:
         log.warning("the silhouettes leave open: %s", text)
@@ -225,18 +227,25 @@ def measure_poses(
     return fit_poses(images, mesh, lenses, angles, [c.intrinsics.covariance for c in cameras])
 
 
-def plane_measurement(
-    rig: RigConfig, cameras: Sequence[CameraImages], poses: PoseFit, angles: Sequence[float]
-) -> StepSize:
+def nominal_projector(
+    rig: RigConfig, cameras: Sequence[CameraImages], poses: PoseFit
+) -> tuple[TwoMirrorProjector, F64]:
+    """In the object frame at the first angle, as the cameras were found there; (6, 6) covariance of its pose."""
+    first = range(0, len(poses.views), len(poses.turns))
+    found, errors = [poses.views[v] for v in first], [poses.covariance(v) for v in first]
+    nominal = TwoMirrorProjector.from_config(rig.projector)
+    return against_cameras(nominal, [c.lens for c in cameras], found, errors)
+
+
+def plane_measurement(cameras: Sequence[CameraImages], poses: PoseFit, projector: TwoMirrorProjector) -> StepSize:
     """The projector's step size from the spots on the white plate of the camera that sees most of them."""
     best = max(range(len(cameras)), key=lambda c: len(cameras[c].plate_points))
-    here = cameras[best]
-    nominal = TwoMirrorProjector.from_config(rig.projector)
-    to_object = np.linalg.inv(poses.views[best * len(angles)].pose)
-    to_projector = nominal.seen_from(turn(angles[0])).pose @ to_object
+    here, view = cameras[best], best * len(poses.turns)
+    to_projector = projector.pose @ np.linalg.inv(poses.views[view].pose)
     local = here.plate_points @ to_projector[:3, :3].T + to_projector[:3, 3]
-    depth = float(poses.translation[best * len(angles), 2])
-    return step_size(local[:, :2], here.plate_steps, local[:, 2], depth, nominal, PLATE_SPOT_MM)
+    turned = block_diag(to_projector[:3, :3], to_projector[:3, :3])
+    motion = turned @ poses.covariance(view) @ turned.T
+    return step_size(local, here.plate_steps, motion, projector, PLATE_SPOT_MM)
 
 
 @dataclass(frozen=True)
@@ -265,9 +274,19 @@ def find_peaks(stream: StreamReader, sensor: Sensor, laser: int) -> Sightings:
 
 
 def measure_projector(
-    stream: StreamReader, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh, poses: PoseFit, size: StepSize
+    stream: StreamReader,
+    rig: RigConfig,
+    sensor: Sensor,
+    mesh: trimesh.Trimesh,
+    poses: PoseFit,
+    size: StepSize,
+    nominal: TwoMirrorProjector,
+    place_error: F64,
 ) -> ProjectorFit:
-    """From the spots on the object, in the object frame at the first angle. All cameras' sightings count."""
+    """From the spots on the object, in the object frame at the first angle. All cameras' sightings count.
+
+    nominal: in that frame, place_error: (6, 6) covariance of its pose
+    """
     plan, ray = stream.plan, RayMeshIntersector(mesh)
     found = find_peaks(stream, sensor, plan.lasers // 2)
     bright = brightness(found.peaks, found.power)
@@ -299,10 +318,8 @@ def measure_projector(
     steps = np.array([(plan.spots[s].u, plan.spots[s].v) for s in spot], float)
     of_angle = np.array([plan.spots[s].angle for s in spot])
     group = np.unique(np.concatenate(patches), return_inverse=True)[1]
-    first = float(np.deg2rad(rig.turntable_angles_deg[0]))
-    nominal = TwoMirrorProjector.from_config(rig.projector).seen_from(turn(first))
     true = projection(place, steps, FALSE_STEPS, np.random.default_rng(0)).inliers
-    fit = refine(nominal, place[true], steps[true], normal[true], eye[true], size, group[true])
+    fit = refine(nominal, place[true], steps[true], normal[true], eye[true], size, group[true], place_error)
     # A matrix from a few noisy spots is a coarse sieve; the model itself says better which sightings are true. It also
     # says how the beam lies on the surface, and so where the light's centroid is beside the axis.
     origin, way = fit.projector.rays(steps)
@@ -313,21 +330,9 @@ def measure_projector(
     place = place - np.where(whole[:, None], np.einsum("nij,nj->ni", turns[:, :3, :3], centroid - axis), 0.0)
     true = whole & (np.linalg.norm(fit.misses(place, steps, normal, eye), axis=1) < GATE * fit.rms_mm)
     log.info("projector: %d of %d sightings of %d images agree", int(true.sum()), len(spot), len(found.peaks))
-    fit = refine(nominal, place[true], steps[true], normal[true], eye[true], size, group[true])
+    fit = refine(nominal, place[true], steps[true], normal[true], eye[true], size, group[true], place_error)
     fit = replace(fit, false=~true, images=len(found.peaks), sightings=len(spot))
     return with_pose_error(fit, poses, int(np.bincount(np.concatenate(views)[true]).argmax()))
-
-
-def with_pose_error(fit: ProjectorFit, poses: PoseFit, view: int) -> ProjectorFit:
-    """The same with what its residuals cannot show: the object's pose before the camera that saw most spots.
-
-    Only what moves the object in the image: along the line of sight, spots stay where they were seen.
-    """
-    to_projector = fit.projector.pose[:3, :3] @ poses.views[view].pose[:3, :3].T
-    across = block_diag(to_projector, to_projector @ np.diag([1.0, 1.0, 0.0]))
-    covariance = fit.covariance.copy()
-    covariance[:6, :6] += across @ poses.image_covariance[view] @ across.T
-    return replace(fit, covariance=covariance)
 
 
 def mean_power(stream: StreamReader) -> F64:

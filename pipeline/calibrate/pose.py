@@ -64,6 +64,12 @@ class PoseFit:
     axis: F64 = field(default_factory=lambda: np.zeros(0))
     axis_error: F64 = field(default_factory=lambda: np.zeros(0))
 
+    def covariance(self, view: int) -> F64:
+        """(6, 6) against what the same lens sees elsewhere: of what it leaves open, which it shares, depth alone."""
+        out = self.image_covariance[view].copy()
+        out[5, 5] = self.translation[view, 2] ** 2
+        return np.asarray(out)
+
 
 @dataclass
 class _Sweep:

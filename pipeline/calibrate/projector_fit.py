@@ -8,7 +8,7 @@ squares, started from what the rig was built to be.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,9 @@ Flags = NDArray[np.bool_]
 DRAWS, SAMPLE = 400, 8
 LEAST_SPOTS = 12
 FLAT = 0.02  # of the spots' extent: thinner than this they are nearly coplanar
-# What the set-up keeps to, standard deviations: the projector's place (by tape measure) and direction, its full angles.
-PLACE_MM, PLACE_RAD, ANGLE_SHARE = 1.0, np.deg2rad(0.5), 0.01
+# To which a set-up keeps a device's place (by tape measure) and direction, standard deviations: what tells the distance.
+PLACE_MM, PLACE_RAD = 1.0, np.deg2rad(0.5)
+ANGLE_SHARE = 0.01  # to which the full angles are known unmeasured, standard deviation
 SHIFT_MM = 1.0  # by which a spot's peak may move, per unit of a direction's sine and of its cube
 HUBER = 2.0  # in units of the spots' own scatter
 GATE = 5.0  # beyond this many scatters a spot is false
@@ -111,38 +112,53 @@ def _misses(matrix: F64, points: F64, steps: F64) -> F64:
 
 @dataclass(frozen=True)
 class StepSize:
-    """full_angle_rad: (2,) over all steps; error_rad: (2,) standard deviations.
+    """full_angle_rad: (2,) over all steps; covariance: (2, 2), rad^2, if the projector stands where it was taken to.
 
-    distance_mm: at which the plane stands if the projector stands where it was built to; as much as it is farther, the
-    angles were measured too large. None: not measured from a plane
+    by_pose: (2, 6) what a change of the projector's pose (as in `ProjectorFit`) would change of them: the plane is seen
+    from the projector only by way of its pose, whose error the fit shares
     """
 
     full_angle_rad: F64
-    error_rad: F64
-    distance_mm: float | None = None
+    covariance: F64
+    by_pose: F64 = field(default_factory=lambda: np.zeros((2, 6)))
+
+    @property
+    def error_rad(self) -> F64:
+        """(2,) standard deviations."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
-def step_size(
-    points: F64, steps: F64, distance: F64, distance_error: float, projector: TwoMirrorProjector, noise: float
-) -> StepSize:
-    """The plane measurement (thesis figure 5.2). points: (N, 2) mm on the plane along the mirrors' two directions.
+def step_size(points: F64, steps: F64, motion: F64, projector: TwoMirrorProjector, noise: float) -> StepSize:
+    """The plane measurement (thesis figure 5.2). points: (N, 3) mm on the plane, projector's frame.
 
-    distance: (N,) mm from the second mirror to the plane, along the axis, at each spot. A step of angle moves the spot
-    by step * (distance + separation) along the first mirror's direction, for that mirror stands further back: the
-    thesis's 2 arctan(a / d) is too large by separation / d there.
+    motion: (6, 6) covariance of the plane's place there: rotation about the object's origin (rad), and shift (mm). A
+    step of angle moves the spot by step * (distance + separation) along the first mirror's direction, for that mirror
+    stands further back: the thesis's 2 arctan(a / d) is too large by separation / d there.
     """
-    angle = projector.angles(steps)
+    full, spread = _full_angles(points, steps, projector, noise)
+    pivot, by_pose = projector.pose[:3, 3], np.empty((2, 6))
+    for k in range(6):
+        h = np.zeros(6)
+        h[k] = 1e-4 if k < 3 else 1e-2
+        ends = [Rotation.from_rotvec(s * h[:3]).apply(points - pivot) + pivot + s * h[3:] for s in (1, -1)]
+        ahead, behind = (_full_angles(end, steps, projector, noise)[0] for end in ends)
+        by_pose[:, k] = (ahead - behind) / (2 * h[k])
+    return StepSize(full, np.diag(spread**2) + by_pose @ motion @ by_pose.T, by_pose)
+
+
+def _full_angles(points: F64, steps: F64, projector: TwoMirrorProjector, noise: float) -> tuple[F64, F64]:
+    """(2,) full angles from spots on the plane, and what the spots' noise (mm) makes of them."""
+    angle, distance = projector.angles(steps), points[:, 2]
     tangent = np.column_stack([np.tan(angle[:, 0]), np.tan(angle[:, 1])])
     # Unfolded: x = (e + sqrt(y^2 + z^2)) tan(theta_x), y = z tan(theta_y).
     reach = np.column_stack([projector.separation_mm + distance * np.hypot(1.0, tangent[:, 1]), distance])
-    full, error = np.empty(2), np.empty(2)
+    full, spread = np.empty(2), np.empty(2)
     for k in (0, 1):
         design = np.column_stack([reach[:, k] * tangent[:, k], np.ones(len(points))])
         (slope, _), *_ = np.linalg.lstsq(design, points[:, k], rcond=None)
-        spread = noise / np.sqrt(((design[:, 0] - design[:, 0].mean()) ** 2).sum())
         full[k] = projector.full_angle_rad[k] * slope
-        error[k] = projector.full_angle_rad[k] * np.hypot(spread, distance_error / distance.mean())
-    return StepSize(full, error, float(distance.mean()))
+        spread[k] = projector.full_angle_rad[k] * noise / np.sqrt(((design[:, 0] - design[:, 0].mean()) ** 2).sum())
+    return full, spread
 
 
 @dataclass(frozen=True)
@@ -180,15 +196,17 @@ def refine(
     to_eye: F64,
     size: StepSize | None = None,
     group: NDArray[np.int64] | None = None,
+    place: F64 | None = None,
 ) -> ProjectorFit:
     """Two-mirror model by robust least squares on what the beam's axis misses the spots by, across the beam, in mm.
 
     start: the nominal projector, points: (N, 3) mm, all in one frame; normals, to_eye: (N, 3) unit; group: (N,) spots
-    of one group err together (default: each for itself)
+    of one group err together (default: each for itself); place: (6, 6) covariance of the nominal pose (default: of a
+    projector set up in the points' own frame)
     """
     nominal = start.full_angle_rad
-    known = StepSize(nominal, nominal * ANGLE_SHARE) if size is None else size
-    precision, target = _known(start, known)
+    known = StepSize(nominal, np.diag((nominal * ANGLE_SHARE) ** 2)) if size is None else size
+    precision, target = _known(own_place(start.pose) if place is None else place, known)
     value = np.concatenate([np.zeros(6), nominal, [0.0, 0.0]])
     group = np.arange(len(points)) if group is None else group
     scatter = np.inf
@@ -220,23 +238,27 @@ def refine(
     )
 
 
-def _known(start: TwoMirrorProjector, size: StepSize) -> tuple[F64, F64]:
-    """(10, 10) precision and (10,) mean of the unknowns before any spot is seen."""
-    # The projector is off by a rotation r about itself and a shift t; the object's origin at x moves by r x x + t.
-    x, y, z = start.pose[:3, 3]
+def own_place(pose: F64) -> F64:
+    """(6, 6) covariance of a (4, 4) frame -> device pose: rotation about the frame's origin (rad) and that origin (mm).
+
+    The device is off by a rotation r about itself and a shift t; the frame's origin at x moves by r x x + t.
+    """
+    x, y, z = pose[:3, 3]
     lever = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0.0]])
     along = np.vstack([np.eye(3), lever]) * PLACE_RAD
-    place = along @ along.T
-    place[3:, 3:] += PLACE_MM**2 * np.eye(3)
+    out = along @ along.T
+    out[3:, 3:] += PLACE_MM**2 * np.eye(3)
+    return np.asarray(out)
+
+
+def _known(place: F64, size: StepSize) -> tuple[F64, F64]:
+    """(10, 10) precision and (10,) mean of the unknowns before any spot is seen."""
     precision = np.zeros((10, 10))
     precision[:6, :6] = np.linalg.inv(place)
     precision[8:, 8:] = SHIFT_MM**-2 * np.eye(2)
-    for k in (0, 1):
-        row = np.zeros(10)
-        row[6 + k] = 1.0
-        if size.distance_mm is not None:
-            row[5] = size.full_angle_rad[k] / size.distance_mm
-        precision += np.outer(row, row) / size.error_rad[k] ** 2
+    # A pose that is off by p gives the plane's angles off by -by_pose p.
+    rows = np.hstack([-size.by_pose, np.eye(2), np.zeros((2, 2))])
+    precision += rows.T @ np.linalg.inv(size.covariance) @ rows
     return precision, np.concatenate([np.zeros(6), size.full_angle_rad, [0.0, 0.0]])
 
 

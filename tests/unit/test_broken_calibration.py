@@ -358,11 +358,12 @@ def step_score(change: Callable[[F64], F64] = lambda steps: steps, separation: f
     """Largest z-score of the two full angles, from spots on a plane."""
     nominal, grid, place = ON_A_PLANE
     given = replace(nominal, separation_mm=separation * nominal.separation_mm)
-    found = projector_fit.step_size(place[:, :2], change(grid), np.full(25, 600.0), 0.5, given, 0.02)
+    found = projector_fit.step_size(place, change(grid), DEPTH_ALONE, given, 0.02)
     return float(np.abs((found.full_angle_rad - nominal.full_angle_rad * TRUE_ANGLES) / found.error_rad).max())
 
 
 TRUE_ANGLES = np.array([1.003, 0.996])
+DEPTH_ALONE = np.diag([0, 0, 0, 0, 0, 0.5**2])
 
 
 def _on_a_plane() -> tuple[TwoMirrorProjector, F64, F64]:

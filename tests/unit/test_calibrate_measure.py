@@ -102,10 +102,15 @@ def captured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RigConfig]
     return folder, capture_all(folder, 11)
 
 
-def test_a_rig_is_calibrated_from_its_own_images(captured: tuple[Path, RigConfig]) -> None:
-    """Faults on. Expected: spots within .15 mm rms, directions within .3 degrees, white balance to .75 %."""
+@pytest.fixture(scope="module")
+def measured(captured: tuple[Path, RigConfig]) -> Measured:
     folder, rig = captured
-    found = measure(folder, rig, lars3_sensor(rig), world().object.mesh)
+    return measure(folder, rig, lars3_sensor(rig), world().object.mesh)
+
+
+def test_a_rig_is_calibrated_from_its_own_images(captured: tuple[Path, RigConfig], measured: Measured) -> None:
+    """Faults on. Expected: spots within .15 mm rms, directions within .3 degrees, white balance to .75 %."""
+    (folder, rig), found = captured, measured
     judged = judge(found, rig, 11, folder)
     assert judged.spots_mm < 0.15
     assert judged.incidence_deg < 0.3
@@ -131,6 +136,25 @@ def test_a_rig_is_calibrated_from_its_own_images(captured: tuple[Path, RigConfig
     assert again == found.calibration
     assert again.source == "measured"
     assert all(np.abs(z).max() < 6 for z in judged.scores.values())
+
+
+def test_a_scan_in_a_frame_of_its_own_gives_the_same_projector(
+    captured: tuple[Path, RigConfig], measured: Measured
+) -> None:
+    """The scan is turned by 3 degrees about the axis and stands 10 mm higher: the projector moves with it.
+
+    Expected: .5 sigma at most, for images are the same. (Held to its place in the rig's own frame: 17 sigma.)
+    """
+    folder, rig = captured
+    motion, mesh = np.eye(4), world().object.mesh.copy()
+    motion[:3, :3] = Rotation.from_rotvec([0, 0, np.deg2rad(3.0)]).as_matrix()
+    motion[2, 3] = 10.0
+    mesh.apply_transform(motion)
+    found = measure(folder, rig, lars3_sensor(rig), mesh).projector
+    there, here = measured.projector.projector.seen_from(np.linalg.inv(motion)), found.projector
+    turned = Rotation.from_matrix(there.pose[:3, :3] @ here.pose[:3, :3].T).as_rotvec()
+    away = np.concatenate([turned, (there.pose - here.pose)[:3, 3], there.full_angle_rad - here.full_angle_rad])
+    assert (np.abs(away) < 0.5 * np.sqrt(np.diag(found.covariance))).all()
 
 
 def test_the_power_of_every_image_is_known(captured: tuple[Path, RigConfig]) -> None:

@@ -13,8 +13,11 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from disco_twin.deviation import actual_rig
 from hw.errors import DiscoError
+from pipeline.calibrate.camera import PinholeCamera
+from pipeline.calibrate.place import against_cameras
 from pipeline.calibrate.projector import TwoMirrorProjector
 from pipeline.calibrate.projector_fit import ProjectorFit, StepSize, dlt, projection, refine, step_size
+from pipeline.capture.targets import make_targets
 
 F64 = NDArray[np.float64]
 
@@ -56,7 +59,7 @@ def lit(seed: int, noise: float = 0.05, false: float = 0.2) -> Lit:
     seen[bad] += 8 * rng.standard_normal((bad.sum(), 3))
     steps = np.array([(world().plan.spots[r].u, world().plan.spots[r].v) for r in ray], float)
     full = actual.projector.full_angle_rad
-    size = StepSize(full * (1 + 0.002 * rng.standard_normal(2)), 0.002 * full)
+    size = StepSize(full * (1 + 0.002 * rng.standard_normal(2)), np.diag((0.002 * full) ** 2))
     nominal = TwoMirrorProjector.from_config(rig.projector)
     return Lit(nominal, actual.projector, world_points, seen, steps, normals, eye, way, bad, size)
 
@@ -132,7 +135,7 @@ def test_a_broken_stage_shows(broken: str) -> None:
     if broken == "wrong sign":
         spots = replace(spots, steps=spots.steps * [-1, 1] + [4095, 0])
     if broken == "degrees for radians":
-        size = StepSize(np.rad2deg(spots.size.full_angle_rad), spots.size.error_rad)
+        size = StepSize(np.rad2deg(spots.size.full_angle_rad), spots.size.covariance)
         spots = replace(spots, size=size)
     if broken == "transposed pose":
         pose = spots.nominal.pose.copy()
@@ -153,11 +156,70 @@ def test_the_plane_measurement_gives_the_step_size() -> None:
     grid = np.stack(np.meshgrid(np.linspace(500, 3600, 5), np.linspace(500, 3600, 5)), axis=-1).reshape(-1, 2)
     origin, way = truth.rays(grid)
     on_plane = origin + ((600 - origin[:, 2]) / way[:, 2])[:, None] * way
-    found = step_size(on_plane[:, :2], grid, np.full(25, 600.0), 0.5, nominal, 0.02)
+    depth = np.diag([0, 0, 0, 0, 0, 0.5**2])
+    found = step_size(on_plane, grid, depth, nominal, 0.02)
     np.testing.assert_allclose(found.full_angle_rad, truth.full_angle_rad, rtol=1e-4)
     assert (found.error_rad > 0).all()
-    single = step_size(on_plane[:, :2], grid, np.full(25, 600.0), 0.5, replace(nominal, separation_mm=0.0), 0.02)
+    single = step_size(on_plane, grid, depth, replace(nominal, separation_mm=0.0), 0.02)
     assert single.full_angle_rad[0] / truth.full_angle_rad[0] - 1 == pytest.approx(12 / 600, rel=0.05)
+
+
+def test_the_plane_measurement_counts_how_its_plane_may_be_moved() -> None:
+    """Perfect spots on a camera's plates, moved by half a degree and .4 mm (standard deviations): chi^2 of 2.
+
+    The mean of 300 is 2 +- .115, and without the rotation beyond all bounds. Depth alone moves both angles as one.
+    """
+    rig, rng, turned = faulty_rig(), np.random.default_rng(6), np.deg2rad(0.5)
+    nominal, (targets, plan) = TwoMirrorProjector.from_config(rig.projector), make_targets(rig, 0)
+    steps = np.array([(a.u, a.v) for a in plan.spots], float)
+    plates = np.array([targets.placements[a.angle].pose for a in plan.spots])
+    origin, way = nominal.rays(steps)
+    along = ((plates[:, :3, 3] - origin) * plates[:, :3, 2]).sum(axis=1) / (way * plates[:, :3, 2]).sum(axis=1)
+    world_points = origin + along[:, None] * way
+    motion, pivot = np.diag([turned**2] * 3 + [0.4**2] * 3), nominal.pose[:3, 3]
+    local = world_points @ nominal.pose[:3, :3].T + pivot
+    scores = []
+    for _ in range(300):
+        off = np.sqrt(np.diag(motion)) * rng.standard_normal(6)
+        there = Rotation.from_rotvec(off[:3]).apply(local - pivot) + pivot + off[3:]
+        found = step_size(there, steps, motion, nominal, 1e-4)
+        miss = found.full_angle_rad - nominal.full_angle_rad
+        scores.append(miss @ np.linalg.inv(found.covariance) @ miss)
+    assert abs(np.mean(scores) - 2) < 4 * 0.115
+    one = step_size(local, steps, np.diag([0, 0, 0, 0, 0, 0.4**2]), nominal, 1e-4).covariance
+    assert one[0, 1] / np.sqrt(one[0, 0] * one[1, 1]) > 0.99
+
+
+def test_the_projector_does_not_depend_on_the_frame_of_the_scan() -> None:
+    """Spots, normals and found cameras moved by 3 degrees and 10 mm: the projector moves with them.
+
+    Held to the place where it was built to stand in the rig's own frame, it does not.
+    """
+    rig, actual = faulty_rig(), actual_rig(faulty_rig(), 7)
+    spots, motion = lit(7, false=0.0), np.eye(4)
+    motion[:3, :3] = Rotation.from_rotvec(np.deg2rad(3.0) * np.array([2, -1, 2]) / 3).as_matrix()
+    motion[:3, 3] = 10.0 * np.array([-1, 2, 2]) / 3
+    cameras, exact = [PinholeCamera.from_config(c) for c in rig.cameras], [1e-12 * np.eye(6)] * len(rig.cameras)
+    fits = []
+    for move in (np.eye(4), motion):
+        found = [c.seen_from(np.linalg.inv(move)) for c in actual.cameras]
+        start, place = against_cameras(spots.nominal, cameras, found, exact)
+        seen = spots.seen @ move[:3, :3].T + move[:3, 3]
+        normals, eyes = (x @ move[:3, :3].T for x in (spots.normals, spots.to_eye))
+        fit = refine(start, seen, spots.steps, normals, eyes, spots.size, place=place)
+        assert np.abs(score(fit, spots.actual.seen_from(np.linalg.inv(move)))).max() < 4
+        fits.append(fit)
+    assert np.abs(score(fits[1], fits[0].projector.seen_from(np.linalg.inv(motion)))).max() < 0.1
+    lost = refine(spots.nominal, seen, spots.steps, normals, eyes, spots.size)
+    assert np.abs(score(lost, fits[1].projector)).max() > 0.5
+
+
+def score(fit: ProjectorFit, truth: TwoMirrorProjector) -> F64:
+    """(8,) z-scores of pose and full angles."""
+    pose = fit.projector.pose
+    turned = Rotation.from_matrix(truth.pose[:3, :3] @ pose[:3, :3].T).as_rotvec()
+    moved, wide = truth.pose[:3, 3] - pose[:3, 3], truth.full_angle_rad - fit.projector.full_angle_rad
+    return np.asarray(np.concatenate([turned, moved, wide]) / np.sqrt(np.diag(fit.covariance)))
 
 
 def test_uncertainties_are_honest() -> None:
@@ -166,9 +228,5 @@ def test_uncertainties_are_honest() -> None:
     for seed in range(24):
         spots = lit(100 + seed)
         fit = fitted(spots)
-        pose = fit.projector.pose
-        turned = Rotation.from_matrix(spots.actual.pose[:3, :3] @ pose[:3, :3].T).as_rotvec()
-        shifted = spots.actual.pose[:3, 3] - pose[:3, 3]
-        wide = spots.actual.full_angle_rad - fit.projector.full_angle_rad
-        scores.append(np.concatenate([turned, shifted, wide]) / np.sqrt(np.diag(fit.covariance)))
+        scores.append(score(fit, spots.actual))
     assert 0.8 < np.sqrt((np.array(scores) ** 2).mean()) < 1.25
