@@ -23,7 +23,7 @@ Flags = NDArray[np.bool_]
 DRAWS, SAMPLE = 400, 8
 LEAST_SPOTS = 12
 FLAT = 0.02  # of the spots' extent: thinner than this they are nearly coplanar
-# To which a set-up keeps a device's place (by tape measure) and direction, standard deviations: what tells the distance.
+# To which a set-up keeps a device's place (by tape measure) and direction, standard deviations; spots tell no distance.
 PLACE_MM, PLACE_RAD = 1.0, np.deg2rad(0.5)
 ANGLE_SHARE = 0.01  # to which the full angles are known unmeasured, standard deviation
 SHIFT_MM = 1.0  # by which a spot's peak may move, per unit of a direction's sine and of its cube
