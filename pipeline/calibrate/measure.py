@@ -33,7 +33,7 @@ from pipeline.calibrate.camera import PinholeCamera, turn
 from pipeline.calibrate.intrinsics import Intrinsics, board_pose, find_corners, fit_intrinsics
 from pipeline.calibrate.peaks import Peak, brightness, find_peak, footprint, seen
 from pipeline.calibrate.photometric import Balance, balance, pixel_areas
-from pipeline.calibrate.place import against_cameras, with_pose_error
+from pipeline.calibrate.place import nominal_projector, with_pose_error
 from pipeline.calibrate.pose import PoseFit, fit_poses
 from pipeline.calibrate.projector import TwoMirrorProjector
 from pipeline.calibrate.projector_fit import GATE, ProjectorFit, StepSize, projection, refine, step_size
@@ -90,7 +90,7 @@ def measure(capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh
     with StreamReader(capture) as stream:
         stream.require_complete()
         poses = measure_poses(stream, sensor, mesh, cameras, angles)
-        nominal, place = nominal_projector(rig, cameras, poses)
+        nominal, place = nominal_projector(rig, [c.lens for c in cameras], poses)
         size = plane_measurement(cameras, poses, nominal)
         fit = measure_projector(stream, rig, sensor, mesh, poses, size, nominal, place)
         watts = mean_power(stream)
@@ -225,16 +225,6 @@ def measure_poses(
         images.append(to_radiance(raw, sensor, 0).radiance / illumination(cameras[stream.plan.camera_of(view)].lens))
     lenses = [c.lens.seen_from(turn(angles[0])) for c in cameras]
     return fit_poses(images, mesh, lenses, angles, [c.intrinsics.covariance for c in cameras])
-
-
-def nominal_projector(
-    rig: RigConfig, cameras: Sequence[CameraImages], poses: PoseFit
-) -> tuple[TwoMirrorProjector, F64]:
-    """In the object frame at the first angle, as the cameras were found there; (6, 6) covariance of its pose."""
-    first = range(0, len(poses.views), len(poses.turns))
-    found, errors = [poses.views[v] for v in first], [poses.covariance(v) for v in first]
-    nominal = TwoMirrorProjector.from_config(rig.projector)
-    return against_cameras(nominal, [c.lens for c in cameras], found, errors)
 
 
 def plane_measurement(cameras: Sequence[CameraImages], poses: PoseFit, projector: TwoMirrorProjector) -> StepSize:

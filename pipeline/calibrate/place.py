@@ -18,8 +18,18 @@ from pipeline.calibrate.camera import PinholeCamera
 from pipeline.calibrate.pose import PoseFit
 from pipeline.calibrate.projector import TwoMirrorProjector
 from pipeline.calibrate.projector_fit import ProjectorFit, own_place
+from pipeline.rig import RigConfig
 
 F64 = NDArray[np.float64]
+
+
+def nominal_projector(
+    rig: RigConfig, cameras: Sequence[PinholeCamera], poses: PoseFit
+) -> tuple[TwoMirrorProjector, F64]:
+    """In the object frame at the first angle, as the cameras were found there; (6, 6) covariance of its pose."""
+    first = range(0, len(poses.views), len(poses.turns))
+    nominal, found = TwoMirrorProjector.from_config(rig.projector), [poses.views[v] for v in first]
+    return against_cameras(nominal, cameras, found, [poses.covariance(v) for v in first])
 
 
 def against_cameras(
