@@ -32,6 +32,7 @@ def figures(found: Measured) -> dict[str, Any]:
         "silhouettes": {
             "residual_px": found.poses.residual_px,
             "edges": found.poses.edges,
+            "scan_error_mm": found.poses.surface_mm,
             "xor_px": list(found.poses.xor_pixels),
             "ambiguity": list(found.poses.ambiguity),
         },

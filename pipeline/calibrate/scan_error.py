@@ -2,12 +2,14 @@
 
 A scanner errs alike over some millimetres; edges err each for itself. Both variances follow from two quadratic forms of
 what a fit leaves: its squares, and its products between places that are near but not adjacent (Rao 1971, variance
-components). The fit takes a part of the errors for motion; the forms' expectations take that into account.
+components). Over which length it errs alike, the likelihood tells. The fit takes a part of the errors for motion; the
+forms' expectations take that into account.
 """
 
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +18,11 @@ F64 = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 
-LENGTH_MM = 10.0  # over which a scanner errs alike, a Gaussian correlation (thesis 4.4)
+LENGTHS_MM = 5.0, 10.0, 20.0  # over which a scanner may err alike, a Gaussian correlation; the likeliest counts
+FACTORS = 4.0 ** np.arange(-2, 4)  # of the patches' variance, tried to tell how likely a length is
 NEAR_MM = 2.0  # places that are nearer share an edge's own error
 MOST_EDGES = 1200
-LEAST_FREEDOM = 2.2  # with fewer the patches' variance is hardly known; Student's factor there is wide enough for all
+LEAST_FREEDOM = 3.0  # with fewer Student's factor grows without bound; three times the variance was enough for 2 to 3
 
 
 def surface_error(j: F64, rest: F64, weight: F64, length: F64, place: F64, inverse: F64) -> tuple[float, F64]:
@@ -35,7 +38,6 @@ def surface_error(j: F64, rest: F64, weight: F64, length: F64, place: F64, inver
     j, rest, length, place = j[::every], rest[::every], length[::every], place[::every]
     weight = weight[::every] * every
     apart = np.linalg.norm(place[:, None, :3] - place[None, :, :3], axis=2)
-    alike = np.exp(-((apart / LENGTH_MM) ** 2)) * np.outer(place[:, 3], place[:, 3])
     taken = inverse @ (j * weight[:, None]).T  # (P, K)
 
     def left(covariance: F64) -> F64:
@@ -43,24 +45,71 @@ def surface_error(j: F64, rest: F64, weight: F64, length: F64, place: F64, inver
         moved = j @ (taken @ covariance)
         return np.asarray(covariance - moved - moved.T + j @ (taken @ covariance @ taken.T) @ j.T)
 
-    kinds = left(np.eye(len(rest))), left(alike)
-    near = (apart > NEAR_MM) & (apart < LENGTH_MM)
-    forms = np.diag(length), np.outer(length, length) * alike * near
-    if not near.any():
+    white, best = left(np.eye(len(rest))), None
+    for millimetres in LENGTHS_MM:
+        alike = np.exp(-((apart / millimetres) ** 2)) * np.outer(place[:, 3], place[:, 3])
+        near = (apart > NEAR_MM) & (apart < millimetres)
+        if near.any():
+            forms = np.diag(length), np.outer(length, length) * alike * near
+            found = _Patches.of(rest, (white, left(alike)), forms, alike, _thinned(apart))
+            best = found if best is None or found.likelihood > best.likelihood else best
+    if best is None:
         log.warning(
             "no two edges of the silhouettes lie %g to %g mm apart: they do not tell how far the scan is off over "
             "whole patches, and poses are stated without it",
             NEAR_MM,
-            LENGTH_MM,
+            LENGTHS_MM[-1],
         )
         return 0.0, np.zeros_like(inverse)
-    to_variance = np.linalg.inv([[float((form * kind).sum()) for kind in kinds] for form in forms])
-    own, common = to_variance @ [float(rest @ form @ rest) for form in forms]
-    common = max(common, 0.0)
-    form = to_variance[1, 0] * forms[0] + to_variance[1, 1] * forms[1]
-    spread = form @ (max(own, 0.0) * kinds[0] + common * kinds[1])
-    freedom = common**2 / max(float((spread * spread.T).sum()), 1e-300)
-    freedom = max(freedom, LEAST_FREEDOM)
-    student = freedom / (freedom - 2.0)
-    push = j.T @ (weight[:, None] * alike * weight) @ j
-    return float(np.sqrt(common)), common * student * push
+    push = j.T @ (weight[:, None] * best.alike * weight) @ j
+    return float(np.sqrt(best.variance)), best.variance * best.student * push
+
+
+@dataclass(frozen=True)
+class _Patches:
+    """Errors that are alike over one length: variance in mm^2, Student's factor of it, (K, K) alike in pixels per mm
+    squared, and the logarithm of how likely what is left is with them.
+    """
+
+    variance: float
+    student: float
+    alike: F64
+    likelihood: float
+
+    @classmethod
+    def of(
+        cls, rest: F64, kinds: tuple[F64, F64], forms: tuple[F64, F64], alike: F64, some: NDArray[np.int64]
+    ) -> _Patches:
+        """rest: (K,) pixels; kinds: (K, K) what is left of both errors; forms: (K, K); some: (S,) places that share no
+        edge's own error, for the likelihood.
+        """
+        to_variance = np.linalg.inv([[float((form * kind).sum()) for kind in kinds] for form in forms])
+        own, common = to_variance @ [float(rest @ form @ rest) for form in forms]
+        own, common = max(own, 1e-3 * float(rest @ rest) / len(rest), 1e-12), max(common, 0.0)
+        both = own * kinds[0] + common * kinds[1]
+        spread = (to_variance[1, 0] * forms[0] + to_variance[1, 1] * forms[1]) @ both
+        freedom = max(common**2 / max(float((spread * spread.T).sum()), 1e-300), LEAST_FREEDOM)
+        likelihood = max(
+            _likelihood(rest[some], kinds[0][np.ix_(some, some)] * own + kinds[1][np.ix_(some, some)] * factor * common)
+            for factor in FACTORS
+        )
+        return cls(common, freedom / (freedom - 2.0), alike, likelihood)
+
+
+def _likelihood(rest: F64, covariance: F64) -> float:
+    """Logarithm, of (S,) normal errors whose (S, S) covariance is known but for its scale, at the likeliest scale."""
+    whole = covariance + 1e-3 * np.diag(covariance).mean() * np.eye(
+        len(rest)
+    )  # a fit leaves fewer freedoms than places
+    scale = float(rest @ np.linalg.solve(whole, rest)) / len(rest)
+    return -0.5 * float(np.linalg.slogdet(whole)[1] + len(rest) * np.log(max(scale, 1e-300)))
+
+
+def _thinned(apart: F64) -> NDArray[np.int64]:
+    """(S,) of the places, none nearer than NEAR_MM to another; apart: (K, K) mm."""
+    free, kept = np.ones(len(apart), bool), []
+    for k in range(len(apart)):
+        if free[k]:
+            kept.append(k)
+            free &= apart[k] > NEAR_MM
+    return np.array(kept, np.int64)
