@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -15,11 +15,14 @@ from numpy.typing import NDArray
 
 from disco_twin.assembly import Connector, free_line, open_camera, require_black
 from disco_twin.folder import write_atomically
-from disco_twin.rig_file import EMULATED, DevicesFile, GenicamDevice
+from disco_twin.rig_file import EMULATED, DevicesFile, GenicamDevice, LaserDevice
 from hw.clock import WallClock
+from hw.devices.mm_ard import ADC_TOP
+from hw.devices.omicron import OmicronLaser
 from hw.errors import DeviceFault, DiscoError, InputError
 from hw.interface import Aim
 from hw.rig import DARK_COUNTS
+from hw.trusted_board import TrustedBoard
 from hw.wiring import Board
 from pipeline.rig import RigConfig
 
@@ -86,6 +89,7 @@ def _shut_after(board: Board) -> Iterator[None]:
     try:
         yield
     finally:
+        board.when_lost(lambda: None)  # the laser that would be told is closed by now
         board.shut()
 
 
@@ -111,8 +115,9 @@ def probe(file: DevicesFile, scene: RigConfig | None, logs: Path | None = None) 
 
     def laser(index: int) -> str:
         with _using(connect.omicron(index)) as head:
-            found = head.identity
-        return f"{found.model} {found.wavelength_nm:g} nm, {found.max_power_mw:g} mW, no. {found.serial_number}; off"
+            found, mw = head.identity, head.require_off()
+        kind = f"{found.model} {found.wavelength_nm:g} nm, {found.max_power_mw:g} mW"
+        return f"{kind}, no. {found.serial_number}; off ({mw:.2f} mW)"
 
     def board() -> str:
         with _using(connect.board()):
@@ -149,35 +154,43 @@ def _camera_says(file: DevicesFile, device: GenicamDevice, shape: tuple[int, int
 def selftest(file: DevicesFile, scene: RigConfig | None, armed: bool, logs: Path | None = None) -> Iterator[Finding]:
     """Exercise every real device. Lasers emit, one behind an open gate at a time, only if `armed`."""
     connect = _connector(file, logs)
-    if file.turntable.port != EMULATED:
-        yield _try("turntable", lambda: _test_table(connect))
-    for device, shape in _shapes(file, scene):
-        yield _try(f"camera {device.name}", partial(_test_camera, file, device, shape))
-    if file.board.port == EMULATED:
-        return
-    try:
-        board = connect.board()
-    except DiscoError as error:
-        yield Finding("mirror board", False, str(error))
-        return
-    try:
-        yield _try("mirrors", lambda: _test_mirrors(file, board))
-        real = [i for i, laser in enumerate(file.lasers) if laser.port != EMULATED]
-        heads = {f"laser {file.lasers[i].wavelength_nm:g} nm": i for i in real}
-        off = [_try(f"{name}, off", partial(_test_off, connect, index)) for name, index in heads.items()]
-        yield from off
-        if all(finding.good for finding in off):
-            yield _try("gates", lambda: _test_lines(file, board))
-        else:  # a laser that may be on must not come out
-            yield Finding("gates", False, "left shut: a laser did not say that it is off")
-        yield _try("photodiode, dark", lambda: _test_dark(file, board))
-        for name, index in heads.items() if armed else ():
-            yield _try(name, partial(_test_laser, connect, board, index))
-    finally:
+    real = [i for i, laser in enumerate(file.lasers) if laser.port != EMULATED]
+    heads = {f"laser {file.lasers[i].wavelength_nm:g} nm": i for i in real}
+    off = [_try(f"{name}, off", partial(_test_off, connect, index)) for name, index in heads.items()]
+    yield from off
+    board = None
+    if file.board.port != EMULATED:
         try:
-            board.close()
+            board = connect.board()  # shuts the gates, whatever the lasers said
         except DiscoError as error:
-            log.warning("%s", error)
+            yield Finding("mirror board", False, str(error))
+            return
+    try:
+        if not all(finding.good for finding in off):  # what may be lit is neither let out nor moved about in
+            yield Finding("gates", False, "left shut, and nothing moved: a laser did not say that it is off")
+            return
+        if file.turntable.port != EMULATED:
+            yield _try("turntable", lambda: _test_table(connect))
+        for device, shape in _shapes(file, scene):
+            yield _try(f"camera {device.name}", partial(_test_camera, file, device, shape))
+        if board is not None:
+            yield from _test_light(connect, board, heads if armed else {})
+    finally:
+        if board is not None:
+            try:
+                board.close()
+            except DiscoError as error:
+                log.warning("%s", error)
+
+
+def _test_light(connect: Connector, board: Board, heads: Mapping[str, int]) -> Iterator[Finding]:
+    """Mirrors, gates and photodiodes of a dark rig; then each of these lasers (name -> index)."""
+    file = connect.file
+    yield _try("mirrors", lambda: _test_mirrors(file, board))
+    yield _try("gates", lambda: _test_lines(file, board))
+    yield _try("photodiode, dark", lambda: _test_dark(file, board))
+    for name, index in heads.items():
+        yield _try(name, partial(_test_laser, connect, board, index))
 
 
 def _test_table(connect: Connector) -> str:
@@ -229,34 +242,65 @@ def _test_dark(file: DevicesFile, board: Board) -> str:
 
 def _test_off(connect: Connector, index: int) -> str:
     with _using(connect.omicron(index)) as head:
-        return f"{head.measured_mw():.2f} mW while off"
+        return f"{head.require_off():.2f} mW while off"
 
 
 def _test_laser(connect: Connector, board: Board, index: int) -> str:
-    """Emission, gate and photodiode against the set point, then off, with the gate open, against darkness."""
+    """Emission behind its shut gate, then through it, against the set point; then off, gate open, against darkness."""
     file, wiring = connect.file, connect.file.lasers[index]
-    lamp = 1 << free_line(file)
     with _shut_after(board), _using(connect.omicron(index)) as head:  # left in reverse: the laser first
-        board.set_lines(lamp)
+        trusted = TrustedBoard(board, connect.clock, [laser.gate_line for laser in file.lasers], _cut(board, head))
+        trusted.require_lines()
+        trusted.aim(*file.board.centre)
+        trusted.switch(free_line(file), True)
         head.arm(wiring.power_mw)
         head.emit()
         connect.clock.sleep(file.warm_up_s)
         own = head.require_power(file.power_tolerance)
-        board.set_lines(lamp | 1 << wiring.gate_line)
-        seen = 1e3 * board.counts(wiring.photodiode_pin) * wiring.watts_per_count
-        low, high = (share * wiring.power_mw for share in wiring.photodiode_limits)
-        if not low <= seen <= high:
-            problem = f"gives {seen:.2f} mW at the photodiode through its open gate (allowed: {low:g} to {high:g})"
-            raise DeviceFault(f"pin {wiring.photodiode_pin}", head.name, problem, "gate_line, photodiode_pin, gain")
+        _require_dark(trusted, wiring, head.name, "emits behind its shut gate", "see that its gate shuts")
+        trusted.open_gate(wiring.gate_line)
+        seen = _through_gate(trusted, wiring, head.name)
         meter = "" if file.power_meter is None else f", power meter {1e3 * _metered(connect):.2f} mW"
         head.stop_emission()
-        dark = board.counts(wiring.photodiode_pin)
-        if dark > DARK_COUNTS:
-            problem = f"is off, and its photodiode still reads {dark} counts"
-            raise DeviceFault(
-                f"pin {wiring.photodiode_pin}", head.name, problem, "check the wiring of gate and interlock"
-            )
+        head.require_off()
+        _require_dark(trusted, wiring, head.name, "is off", "check the wiring of gate and interlock")
         return f"set {wiring.power_mw:g} mW, own reading {own:.2f} mW, photodiode {seen:.2f} mW{meter}; off again"
+
+
+def _cut(board: Board, head: OmicronLaser) -> Callable[[], None]:
+    """Tells board and laser to go dark, without waiting for answers; a device that fails does not stop the other."""
+
+    def cut() -> None:
+        for tell in (board.shut_now, head.off_now):
+            try:
+                tell()
+            except DiscoError as error:
+                log.error("cutting the light: %s", error)
+
+    return cut
+
+
+def _require_dark(board: TrustedBoard, wiring: LaserDevice, name: str, state: str, remedy: str) -> None:
+    counts = board.counts(wiring.photodiode_pin)
+    board.require_lines()
+    if counts > DARK_COUNTS:
+        problem = f"{state}, and its photodiode reads {counts} counts (allowed: {DARK_COUNTS})"
+        raise DeviceFault(f"pin {wiring.photodiode_pin}", name, problem, remedy)
+
+
+def _through_gate(board: TrustedBoard, wiring: LaserDevice, name: str) -> float:
+    """Power at the photodiode behind the open gate, in mW."""
+    counts, pin = board.counts(wiring.photodiode_pin), f"pin {wiring.photodiode_pin}"
+    board.require_lines()
+    if counts >= ADC_TOP:
+        problem = f"saturates its photodiode ({counts} counts; allowed: below {ADC_TOP})"
+        raise DeviceFault(pin, name, problem, "lower the gain of its amplifier, then measure watts_per_count anew")
+    seen = 1e3 * counts * wiring.watts_per_count
+    low, high = (share * wiring.power_mw for share in wiring.photodiode_limits)
+    if not low <= seen <= high:
+        problem = f"gives {seen:.2f} mW at the photodiode through its open gate (allowed: {low:g} to {high:g})"
+        raise DeviceFault(pin, name, problem, "check gate_line, photodiode_pin and the amplifier's gain")
+    return seen
 
 
 # ---- emulated devices for another program

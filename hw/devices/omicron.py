@@ -28,6 +28,8 @@ ATTEMPTS = 3
 EMISSION_S = 8.0  # LOn takes about 3 s
 RESET_S = 12.0  # RsC takes about 5 s
 POLL_S = 0.1
+OFF_S = 1.0  # from LOf until the laser's own reading has fallen
+OFF_SHARE = 0.01  # of the maximum power: offset of the laser's own photodiode
 WAVELENGTH_TOLERANCE_NM = 10.0
 SEPARATOR = re.compile("[|\xa7]")  # 0xA7, or `|` after ?GFw|
 SAFE_OFF = Mode.BIAS | Mode.RELEASE | Mode.AUTOSTART  # cleared whenever the laser is not to emit
@@ -58,6 +60,7 @@ class OmicronLaser:
         self.identity = self._identify(wavelength_nm)
         self.armed_mw = 0.0
         self.force_off()
+        self.require_off()
 
     @property
     def name(self) -> str:
@@ -216,6 +219,26 @@ class OmicronLaser:
                 failed.append(error)
         if failed:
             raise failed[0]
+
+    def require_off(self) -> float:
+        """Its own reading in mW, dark twice in a row; refused where it says that it emits or measures light.
+
+        That a command was answered is no proof that it was obeyed.
+        """
+        clock, most = self.link.clock, OFF_SHARE * self.identity.max_power_mw
+        end, dark = clock.now() + OFF_S, 0
+        while True:
+            status, measured = self.status(), self.measured_mw()
+            dark = dark + 1 if not status & (Status.ON | Status.PREHEAT) and abs(measured) <= most else 0
+            if dark == 2:
+                return measured
+            if clock.now() > end:
+                said = "on" if Status.ON in status else "preheating" if Status.PREHEAT in status else "off"
+                problem = (
+                    f"was told to go off, says that it is {said} and measures {measured:.2f} mW (allowed: {most:g})"
+                )
+                raise DeviceFault(self.link.url, self.name, problem, "switch it off by its key and have it serviced")
+            clock.sleep(POLL_S)
 
     def arm(self, power_mw: float) -> None:
         """Allow light of this power; none leaves the laser before `emit`."""

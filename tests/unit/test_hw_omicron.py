@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 from serial_fakes import BoardBench, LaserBench, TableBench
 
-from disco_twin.firmware.omicron import LaserHead
+from disco_twin.firmware.omicron import COMMANDS, LaserHead
 from disco_twin.firmware.wire import garbled, late, lost
 from hw.devices.omicron import OmicronLaser
 from hw.devices.omicron_protocol import Mode, Status
@@ -61,6 +61,21 @@ def test_connecting_switches_a_running_laser_off_for_good() -> None:
     bench.clock.sleep(10)
     assert head.emission(bench.now()) == 0.0
     assert not head.stored_mode & (1 << 3 | 1 << 4 | 1 << 14)
+
+
+@pytest.mark.parametrize("says_off", [False, True], ids=["its status says on", "only its photodiode tells"])
+def test_a_laser_that_says_yes_and_stays_on_is_not_called_off(monkeypatch: pytest.MonkeyPatch, says_off: bool) -> None:
+    """LOf, TPP and SOM are answered with yes, GOM with what was asked for, and none of them is obeyed."""
+    for letters in ("LOf", "TPP", "SOM"):
+        monkeypatch.setitem(COMMANDS, letters, lambda head, arguments, now: ">")
+    monkeypatch.setitem(COMMANDS, "GOM", lambda head, arguments, now: "0000")
+    if says_off:
+        monkeypatch.setitem(COMMANDS, "GAS", lambda head, arguments, now: "02C0")
+    bench = LaserBench(head=LaserHead(532.0, 100.0, stored_level=0xFFF))
+    assert bench.head.switch_on(bench.now())
+    bench.clock.sleep(10.0)
+    with pytest.raises(DeviceFault, match=r"was told to go off, says that it is o.* measures 100.00 mW \(allowed: 1\)"):
+        bench.connect()
 
 
 def test_no_light_before_it_is_armed_and_told_to_emit() -> None:

@@ -8,9 +8,12 @@ import pytest
 from test_capture_twin import RIG, Glow
 
 from disco_twin.cli import main
+from disco_twin.firmware.emulate import Emulation
+from disco_twin.firmware.omicron import COMMANDS, Command, LaserHead
 from disco_twin.rig import TwinRig
-from disco_twin.rig_commands import emulated_devices, rig_file_of, selftest, served
+from disco_twin.rig_commands import emulated_devices, probe, rig_file_of, selftest, served
 from disco_twin.rig_rules import load_rig_file
+from hw.devices.omicron_protocol import Mode
 from hw.errors import SwitchedOff
 from pipeline.capture.lasers import read_lasers
 from pipeline.rig import RigConfig
@@ -77,7 +80,7 @@ def test_probe_and_selftest_of_served_devices(
         findings = list(selftest(load_rig_file(path), None, armed=True))
         assert all(f.good for f in findings) and len(findings) == 10
         names = [f.name for f in findings]  # no gate is opened before every laser has said that it is off
-        assert names.index("gates") == 1 + max(i for i, name in enumerate(names) if name.endswith(", off"))
+        assert [name.endswith(", off") for name in names] == [True] * 3 + [False] * 7 and names[3] == "turntable"
         assert sum("own reading 10.00 mW, photodiode 10.0" in f.text for f in findings) == 3
         assert devices[0].bench.hazards == []  # the warning lamp is lit before each of the lasers
         board = Path(path.parent, "board")
@@ -97,7 +100,9 @@ def test_ctrl_c_in_a_selftest_does_not_go_on_to_the_next_laser(tmp_path: Path, m
     tried = []
 
     class Head:
-        def measured_mw(self) -> float:
+        name = "laser 635 nm"
+
+        def require_off(self) -> float:
             return 0.0
 
         def arm(self, power_mw: float) -> None:
@@ -107,7 +112,8 @@ def test_ctrl_c_in_a_selftest_does_not_go_on_to_the_next_laser(tmp_path: Path, m
             raise KeyboardInterrupt
 
         def close(self) -> None:
-            raise SwitchedOff("guard://laser0", "the port of the laser", "is closed", "none")
+            if tried:
+                raise SwitchedOff("guard://laser0", "the port of the laser", "is closed", "none")
 
     monkeypatch.setattr("disco_twin.assembly.Connector.omicron", lambda self, index: Head())
     with served(RIG, 3, tmp_path / "ports") as path:
@@ -126,7 +132,86 @@ def test_no_gate_is_tested_where_a_laser_may_be_on(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr("disco_twin.assembly.Connector.omicron", unreachable)
     with served(RIG, 3, tmp_path / "ports") as path:
         findings = {f.name: f for f in selftest(load_rig_file(path), None, armed=False)}
-    assert not findings["gates"].good and "left shut" in findings["gates"].text
+    assert not findings["gates"].good and "left shut" in findings["gates"].text and "turntable" not in findings
+
+
+def quick(monkeypatch: pytest.MonkeyPatch) -> Emulation:
+    """Emulated devices in real time without their waits, as `served` will serve them."""
+    monkeypatch.setattr("disco_twin.firmware.omicron.EMISSION_S", 0.05)
+    monkeypatch.setattr("disco_twin.firmware.turning.SPEED_DEG_S", 720.0)
+    monkeypatch.setattr("hw.devices.mm_ard.BOOT_S", 0.05)
+    devices = emulated_devices(RIG, 3)
+    monkeypatch.setattr("disco_twin.rig_commands.emulated_devices", lambda scene, seed: devices)
+    return devices
+
+
+def deaf_to(obey: Command, deaf: LaserHead, answer: str) -> Command:
+    """This command, which one laser answers without obeying."""
+    return lambda head, arguments, now: answer if head is deaf else obey(head, arguments, now)
+
+
+@pytest.mark.parametrize("command", ["probe", "selftest"])
+def test_a_laser_that_says_off_and_emits_is_not_let_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """Laser 0 answers every command with yes and obeys none."""
+    bench = quick(monkeypatch).bench
+    deaf = bench.heads[0]
+    for letters, answer in (("LOf", ">"), ("TPP", ">"), ("SOM", ">"), ("GOM", "0000")):
+        monkeypatch.setitem(COMMANDS, letters, deaf_to(COMMANDS[letters], deaf, answer))
+    lines: list[int] = []
+    set_pattern = bench.board.set_pattern
+
+    def pattern_set(pattern: int) -> None:
+        lines.append(pattern)
+        set_pattern(pattern)
+
+    monkeypatch.setattr(bench.board, "set_pattern", pattern_set)
+    with served(RIG, 3, tmp_path / "ports") as path:
+        deaf.mode, deaf.level, deaf.on_since = int(Mode.BIAS | Mode.RELEASE), 1.0, bench.clock.now() - 60.0
+        assert deaf.emission(bench.clock.now()) == 1.0
+        file = load_rig_file(path)
+        run = probe(file, None) if command == "probe" else selftest(file, None, armed=True)
+        findings = {f.name: f for f in run}
+    first = findings["laser 635 nm" if command == "probe" else "laser 635 nm, off"]
+    assert not first.good and "was told to go off, says that it is on" in first.text
+    assert sum(not f.good for f in findings.values()) == (1 if command == "probe" else 2)
+    assert command == "probe" or not findings["gates"].good
+    assert not any(pattern & 0b111 for pattern in lines)
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        ("leaks", "emits behind its shut gate, and its photodiode reads"),
+        ("saturates", "saturates its photodiode (1023 counts"),
+    ],
+)
+def test_an_armed_selftest_finds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str, says: str) -> None:
+    """A gate that lets light through; an amplifier at its end."""
+    bench = quick(monkeypatch).bench
+    lit = bench.board.sample
+    gates: list[int] = []
+    set_pattern = bench.board.set_pattern
+
+    def leak(pin: int) -> int:
+        return 500 if bench.heads[pin].emission(bench.clock.now()) else 0
+
+    def pattern_set(pattern: int) -> None:
+        set_pattern(pattern)
+        gates.append(pattern & 0b111)
+
+    if fault == "leaks":
+        monkeypatch.setattr(bench.board, "sample", leak)
+    elif fault == "saturates":
+        monkeypatch.setattr(bench.board, "sample", lambda pin: 1023 if lit(pin) else 0)
+    monkeypatch.setattr(bench.board, "set_pattern", pattern_set)
+    with served(RIG, 3, tmp_path / "ports") as path:
+        path.write_text(path.read_text().replace("[0.1, 1.5]", "[0.1, 9.0]"))
+        found = {f.name: f for f in selftest(load_rig_file(path), None, armed=True)}["laser 635 nm"]
+    assert not found.good and says in found.text, found
+    assert fault == "saturates" or gates[gates.index(0b100) + 1 :].count(0b001) == 0  # after the test of the lines
+    assert bench.hazards == [] and bench.light() == []
 
 
 def test_nothing_real_is_said_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
