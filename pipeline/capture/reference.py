@@ -1,4 +1,4 @@
-"""Has the rig moved while the capture was interrupted? A stored spot is shot again and compared.
+"""Has the rig moved while the capture was interrupted? A stored spot of every laser is shot again and compared.
 
 Compared are laser power (photodiode), radiance per watt and where the light lies in the image. Anything beyond the
 tolerances is refused with its figures: images before and after would not belong to one object in one place.
@@ -7,6 +7,7 @@ tolerances is refused with its figures: images before and after would not belong
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,8 @@ log = logging.getLogger(__name__)
 
 F64 = NDArray[np.float64]
 
-LOOK_BACK = 30  # stored images, among which the brightest is the reference
+LOOK_BACK = 30  # stored images, among which the brightest of a laser is its reference
+LOOK_FURTHER = 300  # images of a laser, spread over all before these, of which the last one that is bright serves
 BRIGHT_SIGMA = 50.0  # light of all pixels together, in its standard deviations: below, nothing can be verified
 SHIFT_PX = 0.5
 POWER_SHARE = 0.2
@@ -64,17 +66,42 @@ class Comparison:
         )
 
 
-def require_unmoved(rig: Rig, stored: StreamReader, sensor: Sensor) -> Comparison | None:
-    """Shoot a stored spot again, and refuse to go on if it differs. None: nothing stored is bright enough to tell.
+@dataclass(frozen=True)
+class _Reference:
+    """A stored spot. radiance: per watt, and its variance, (H, W) each; significance: in standard deviations."""
 
-    Leaves turntable, mirrors and clock at the reference, gates shut.
+    address: ImageAddress
+    radiance: F64
+    variance: F64
+    significance: float
+
+
+def require_unmoved(rig: Rig, stored: StreamReader, sensor: Sensor) -> list[Comparison]:
+    """Shoot a stored spot of every laser again; refuse to go on if one differs, or if none is bright enough to tell.
+
+    A laser without a stored spot has nothing to be compared with. Leaves turntable, mirrors and clock at the last
+    reference, gates shut.
     """
-    reference = _brightest(stored, sensor)
-    if reference is None:
-        log.warning("none of the last stored images is bright enough to tell whether the rig has moved")
-        return None
-    address, then, variance = reference
-    plan, meta = stored.plan, stored.meta(address)
+    of_laser: list[list[int]] = [[] for _ in range(stored.plan.lasers)]
+    for index in range(len(stored) - 1, -1, -1):
+        address = stored.plan.address(index)
+        if address.kind == "spot":
+            of_laser[address.laser].append(index)
+    found = {laser: _reference(stored, sensor, indices) for laser, indices in enumerate(of_laser) if indices}
+    dim = [laser for laser, reference in found.items() if reference is None]
+    if dim and len(dim) == len(found):
+        raise RigMoved(
+            "no stored spot is bright enough to tell whether the rig has moved since the capture was interrupted. "
+            "Remedy: start a new capture in another folder"
+        )
+    if dim:
+        log.warning("no stored spot of laser %s is bright enough to tell whether it has changed", str(dim)[1:-1])
+    return [_require_same(rig, stored, sensor, reference) for reference in found.values() if reference is not None]
+
+
+def _require_same(rig: Rig, stored: StreamReader, sensor: Sensor, then: _Reference) -> Comparison:
+    """Shoot one reference again."""
+    plan, address, meta = stored.plan, then.address, stored.meta(then.address)
     aim = plan.spots[address.spot]
     rig.turntable.move(meta.angle_rad)
     rig.projector.move(aim.u, aim.v)
@@ -86,7 +113,7 @@ def require_unmoved(rig: Rig, stored: StreamReader, sensor: Sensor) -> Compariso
         raise RigMoved(f"no laser light: the photodiode reads {power:g} W where it read {meta.photodiode_w:g} W")
     again = to_radiance(raw, sensor, address.laser)
     now, noise = again.radiance / power, again.variance / power**2
-    result = compare(then, np.asarray(now, float), variance + noise, power / meta.photodiode_w)
+    result = compare(then.radiance, np.asarray(now, float), then.variance + noise, power / meta.photodiode_w)
     log.info("reference (%s): %s", address, result)
     if result.moved:
         raise RigMoved(
@@ -96,24 +123,31 @@ def require_unmoved(rig: Rig, stored: StreamReader, sensor: Sensor) -> Compariso
     return result
 
 
-def _brightest(stored: StreamReader, sensor: Sensor) -> tuple[ImageAddress, F64, F64] | None:
-    """The reference: its address, radiance per watt and variance, (H, W) each."""
-    best, found = BRIGHT_SIGMA, None
-    for index in range(len(stored) - 1, max(-1, len(stored) - 1 - LOOK_BACK), -1):
-        address = stored.plan.address(index)
-        if address.kind != "spot" or not stored.meta(index).photodiode_w > 0:
-            continue
-        try:
-            image = to_radiance(stored.read(index), sensor, address.laser)
-        except CorruptImage as error:
-            log.warning("%s", error)
-            continue
+def _reference(stored: StreamReader, sensor: Sensor, indices: Sequence[int]) -> _Reference | None:
+    """The brightest of a laser's latest images or, if they are all dim, an earlier one. indices: the last one first."""
+    near = [index for index in indices if index >= len(stored) - LOOK_BACK]
+    looked = [image for index in near if (image := _bright(stored, sensor, index)) is not None]
+    if looked:
+        return max(looked, key=lambda image: image.significance)
+    before = indices[len(near) :]
+    spread = before[:: 1 + len(before) // LOOK_FURTHER]
+    return next((image for index in spread if (image := _bright(stored, sensor, index)) is not None), None)
+
+
+def _bright(stored: StreamReader, sensor: Sensor, index: int) -> _Reference | None:
+    """A stored spot, unless it is damaged or too dim."""
+    address = stored.plan.address(index)
+    try:
         watts = stored.meta(index).photodiode_w
-        radiance, variance = image.radiance.astype(float) / watts, image.variance.astype(float) / watts**2
-        significance = radiance.sum() / np.sqrt(variance.sum())
-        if significance > best:
-            best, found = significance, (address, radiance, variance)
-    return found
+        if not watts > 0:
+            return None
+        image = to_radiance(stored.read(index), sensor, address.laser)
+    except CorruptImage as error:
+        log.warning("%s", error)
+        return None
+    radiance, variance = image.radiance.astype(float) / watts, image.variance.astype(float) / watts**2
+    significance = float(radiance.sum() / np.sqrt(variance.sum()))
+    return _Reference(address, radiance, variance, significance) if significance > BRIGHT_SIGMA else None
 
 
 def compare(then: F64, now: F64, variance: F64, power: float) -> Comparison:

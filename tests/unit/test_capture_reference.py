@@ -16,8 +16,9 @@ from disco_twin.rig import TwinRig
 from hw.interface import Aim
 from hw.record import Sensor
 from pipeline.capture.loop import capture
+from pipeline.capture.plan import Plan
 from pipeline.capture.reference import Comparison, RigMoved, compare
-from pipeline.capture.stream import StreamWriter
+from pipeline.capture.stream import StreamReader, StreamWriter
 
 SENSOR = lars3_sensor(RIG)
 
@@ -110,8 +111,54 @@ def test_a_weaker_laser_is_refused(tmp_path: Path) -> None:
         capture(emulation.serial_rig(), PLAN, tmp_path, sensor=SENSOR)
 
 
-def test_dim_images_cannot_be_compared_and_that_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    interrupted(tmp_path, 5)
+def test_every_laser_is_compared(tmp_path: Path) -> None:
+    """Rationale: half of one laser's light lost behind its photodiode. Expected: refused, whichever laser it is."""
+    interrupted(tmp_path, 9)
+    before = contents(tmp_path)
+
+    class Weaker(Glow):
+        def __init__(self, weak: int) -> None:
+            super().__init__()
+            self.weak = weak
+
+        def image(self, camera: int, aim: Aim, laser: int) -> NDArray[np.float32]:
+            return super().image(camera, aim, laser) * np.float32(0.5 if laser == self.weak else 1.0)
+
+    for laser in range(3):
+        emulation = Emulation(TwinRig(RIG, Weaker(laser), seed=5))
+        with pytest.raises(RigMoved, match=rf"laser {laser}\).*radiance per watt -(49|50)\.\d %.*Remedy"):
+            capture(emulation.serial_rig(), PLAN, tmp_path, sensor=SENSOR)
+        assert contents(tmp_path) == before and emulation.bench.light() == []
+
+
+def test_nothing_bright_enough_is_refused(tmp_path: Path) -> None:
+    """Unless nothing but a silhouette is stored."""
     blind = Sensor(**SENSOR.__dict__ | {"read_noise_e": 1e9})
-    capture(Emulation(TwinRig(RIG, Glow(), seed=5)).serial_rig(), PLAN, tmp_path, sensor=blind)
-    assert "bright enough" in caplog.text
+    interrupted(tmp_path / "spots", 5)
+    with pytest.raises(RigMoved, match=r"no stored spot is bright enough.*Remedy"):
+        capture(Emulation(TwinRig(RIG, Glow(), seed=5)).serial_rig(), PLAN, tmp_path / "spots", sensor=blind)
+    interrupted(tmp_path / "none", 1)
+    capture(Emulation(TwinRig(RIG, Glow(), seed=5)).serial_rig(), PLAN, tmp_path / "none", sensor=blind)
+
+
+def test_earlier_views_are_looked_at_where_the_last_one_is_dim(tmp_path: Path) -> None:
+    """Rationale: the second camera sees nothing of 36 spots. Expected: the first one's tell that the rig has moved."""
+    aims = tuple(Aim(k * 2 // 24, 1900 + 10 * k, 2000) for k in range(24))
+    plan = Plan(("front", "back"), (0.0, float(np.pi)), aims, lasers=3)
+
+    class Dim(Moved):
+        def __init__(self, fail_at: int, pixels: int) -> None:
+            super().__init__(fail_at)
+            self.pixels = pixels
+
+        def image(self, camera: int, aim: Aim, laser: int) -> NDArray[np.float32]:
+            image = Glow.image(self, camera, aim, laser) * np.float32(1e-9 if camera else 1.0)
+            return np.roll(image, self.pixels, axis=1)
+
+    with pytest.raises(RuntimeError, match="out of light"):
+        capture(Emulation(TwinRig(RIG, Dim(74 + 36, 0), seed=5)).serial_rig(), plan, tmp_path)
+    with pytest.raises(RigMoved, match=r"view 1, .*moved by \+3.0"):
+        capture(Emulation(TwinRig(RIG, Dim(-1, 3), seed=5)).serial_rig(), plan, tmp_path, sensor=SENSOR)
+    with pytest.raises(RuntimeError, match="out of light"):
+        capture(Emulation(TwinRig(RIG, Dim(5, 0), seed=5)).serial_rig(), plan, tmp_path, sensor=SENSOR)
+    assert len(StreamReader(tmp_path)) == 74 + 36 + 2  # three were references
