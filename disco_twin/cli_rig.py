@@ -12,6 +12,7 @@ from rich.console import Console
 
 if TYPE_CHECKING:
     from disco_twin.rig_commands import Finding
+    from disco_twin.rig_file import DevicesFile
     from pipeline.rig import RigConfig
 
 rig_app = typer.Typer(help="Devices: find them, test them, emulate them.", no_args_is_help=True)
@@ -31,18 +32,16 @@ LogsOption = Annotated[
 def probe(rig: RigPath, scene: SceneOption = None, logs: LogsOption = None) -> None:
     """Connect to every real device and show what it is. Switches lasers off and shuts gates; nothing moves."""
     from disco_twin.rig_commands import probe as run_probe
-    from disco_twin.rig_rules import load_rig_file
 
-    _show(run_probe(load_rig_file(rig), _rig_of(scene), logs))
+    _show(run_probe(*_loaded(rig, scene), logs))
 
 
 @rig_app.command()
 def selftest(rig: RigPath, scene: SceneOption = None, arm: ArmOption = False, logs: LogsOption = None) -> None:
     """Move, expose and read back every real device. Lasers emit only with --arm."""
     from disco_twin.rig_commands import selftest as run_selftest
-    from disco_twin.rig_rules import load_rig_file
 
-    _show(run_selftest(load_rig_file(rig), _rig_of(scene), arm, logs))
+    _show(run_selftest(*_loaded(rig, scene), arm, logs))
 
 
 @rig_app.command()
@@ -64,10 +63,17 @@ def emulate(
             console.print("ended")
 
 
-def _rig_of(scene: Path | None) -> RigConfig | None:
+def _loaded(path: Path, scene: Path | None) -> tuple[DevicesFile, RigConfig | None]:
+    """The rig file, and the rig of the scene that goes with it."""
+    from disco_twin.rig_rules import load_rig_file, require_scene
     from disco_twin.scene import load_scene
 
-    return None if scene is None else load_scene(scene).rig
+    file = load_rig_file(path)
+    if scene is None:
+        return file, None
+    rig = load_scene(scene).rig
+    require_scene(file, rig, path)
+    return file, rig
 
 
 def _show(findings: Iterable[Finding]) -> None:

@@ -22,7 +22,7 @@ PROJECTOR_STEPS = 4096  # of the board's 12-bit converters
 Positive = Annotated[float, Field(gt=0)]
 Line = Annotated[int, Field(ge=0, le=5)]
 Step = Annotated[int, Field(ge=0, lt=PROJECTOR_STEPS)]
-Port = Annotated[str, Field(min_length=1, max_length=200)]
+Port = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]  # no control characters
 
 
 class LaserDevice(Strict):
@@ -63,7 +63,7 @@ class ZaberDevice(Turning):
     """A Zaber rotary stage, ASCII protocol."""
 
     kind: Literal["zaber"]
-    microsteps_per_deg: Positive
+    microsteps_per_deg: Annotated[float, Field(gt=0, le=1e6)]
     device: Annotated[int, Field(ge=1, le=99)] = 1
     axis: Annotated[int, Field(ge=1, le=9)] = 1
 

@@ -38,7 +38,10 @@ def _require_distinct(what: str, used: Mapping[str, object], choice: str, remedy
     """Refuse the second of two keys that name the same thing: a port's links are the port."""
     first: dict[object, str] = {}
     for key, value in used.items():
-        thing = Path(value).resolve() if isinstance(value, str) and value.startswith("/") else value
+        try:
+            thing = Path(value).resolve() if isinstance(value, str) and value.startswith("/") else value
+        except (ValueError, RuntimeError, OSError) as error:  # links that lead back to themselves
+            raise InputError(f"leads nowhere ({error})", key=key, value=value, remedy=remedy) from error
         if thing in first:
             raise InputError(
                 f"is {what} of {first[thing]} as well", key=key, value=value, allowed=choice, remedy=remedy

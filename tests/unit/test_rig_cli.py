@@ -214,6 +214,17 @@ def test_an_armed_selftest_finds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert bench.hazards == [] and bench.light() == []
 
 
+@pytest.mark.parametrize("command", ["probe", "selftest"])
+def test_another_scenes_rig_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
+    """Its cameras have no size."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "rig.toml").write_text(text().replace('name = "front"', 'name = "top"'))
+    with pytest.raises(SystemExit) as end:
+        main(["rig", command, str(tmp_path / "rig.toml"), "--scene", str(tmp_path / "scene.toml")])
+    said = capsys.readouterr().err
+    assert end.value.code == 2 and said.count("\n") == 1 and "the scene has other cameras" in said, said
+
+
 def test_nothing_real_is_said_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "rig.toml").write_text(text())
     with pytest.raises(SystemExit) as end:
