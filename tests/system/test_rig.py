@@ -141,6 +141,20 @@ def change(path: Path, old: str, new: str) -> None:
     path.write_text(path.read_text().replace(old, new))
 
 
+def begin_again(scene: Path, out: Path, rig: Path, before: list[Any]) -> Path:
+    """What the fake camera leaves to do: no spot stands out of its wandering pattern, so nothing can be compared."""
+    status, said = finish(disco_twin("capture", scene, "--out", out, "--rig", rig, "--arm"))
+    assert status == 2 and "no stored spot is bright enough" in said and "Remedy: start a new capture" in said, said
+    with StreamReader(out / "capture") as stream:
+        assert len(stream) == len(before)
+        assert all((stream.read(i).charge == charge).all() for i, charge in enumerate(before))
+    again = out.with_name("again")
+    status, said = finish(disco_twin("capture", scene, "--out", again, "--rig", rig, "--arm"))
+    assert status == 0, said
+    assert not emits(rig)
+    return again
+
+
 TOO_NOISY_TO_TELL = ("read_noise_e = 300.0", "read_noise_e = 1e9")  # the fake camera's test pattern wanders
 
 
@@ -164,14 +178,10 @@ def test_capture_killed_resumed_and_looked_at(rig: Path, camera: Any, tmp_path: 
     status, said = finish(disco_twin("capture", scene, "--out", out, "--rig", rig, "--arm"))
     assert status == 2 and "read_noise_e = 1000000000.0: the capture in this folder was begun with 300.0" in said, said
     change(out / "capture" / "devices.toml", *TOO_NOISY_TO_TELL)
-    status, said = finish(disco_twin("capture", scene, "--out", out, "--rig", rig, "--arm"))
-    assert status == 0, said
-    assert not emits(rig)
+    out = begin_again(scene, out, rig, before)
     with StreamReader(out / "capture") as stream:
         stream.require_complete()
         assert stream.verify() == [] and len(stream) == 32
-        for index, charge in enumerate(before):
-            assert (stream.read(index).charge == charge).all()
         assert all(abs(stream.meta(i).photodiode_w - 0.01) < 1e-4 for i in range(len(stream)) if i not in (0, 16))
     status, said = finish(disco_twin("quality", out / "capture"))
     assert status == 0 and said.count("front") == 2, said
@@ -181,7 +191,7 @@ def test_capture_killed_resumed_and_looked_at(rig: Path, camera: Any, tmp_path: 
 
 
 def test_a_guard_that_is_killed_in_the_middle_of_a_scan(rig: Path, camera: Any, tmp_path: Path) -> None:
-    """Rationale: nobody would switch the laser off then. Expected: dark, one line that says so; resumed."""
+    """Rationale: nobody would switch the laser off then. Expected: dark, one line that says so; nothing lost."""
     scene, out = tmp_path / "scene.toml", tmp_path / "out"
     change(rig, *TOO_NOISY_TO_TELL)
     process = begun(rig, tmp_path)
@@ -197,9 +207,6 @@ def test_a_guard_that_is_killed_in_the_middle_of_a_scan(rig: Path, camera: Any, 
     with StreamReader(out / "capture") as stream:
         before = [stream.read(i).charge for i in range(len(stream))]
     assert 0 < len(before) < 32
-    status, said = finish(disco_twin("capture", scene, "--out", out, "--rig", rig, "--arm"))
-    assert status == 0, said
+    out = begin_again(scene, out, rig, before)
     with StreamReader(out / "capture") as stream:
         stream.require_complete()
-        assert all((stream.read(i).charge == charge).all() for i, charge in enumerate(before))
-    assert not emits(rig)
