@@ -16,6 +16,9 @@ from pipeline.calibrate.camera import PinholeCamera
 
 F64 = NDArray[np.float64]
 
+PLACE_SHARE = 5e-4  # tan(45 degrees) times what a board's tilt is known to: by this much the plate's area errs
+PLACE_FREEDOM = 2.0  # few: places that do differ by far more than that are believed
+
 
 @dataclass(frozen=True)
 class Balance:
@@ -52,10 +55,8 @@ def balance(light: F64, reading: F64, share: F64, place: NDArray[np.int64]) -> B
 
     place: (N,) which exposures were made in one place of the plate; a plate's pose errs for all of them alike
 
-    Exposures of one place scatter by speckle; places differ by a variance of their own, alike for all lasers: what
-    their means differ by beyond that scatter (variance components, the moments of DerSimonian and Laird 1986). As
-    n + 1 places leave it n degrees of freedom, it counts n / (n - 2) times (Student); two or three places, for which
-    that does not exist, 5 and 4 times. One place tells nothing of it.
+    Exposures of one place scatter by speckle; places differ by more than that, alike for all lasers, as far as the
+    plate's poses err (`place_variance`).
     """
     ratio = np.pi * light / (share[:, None] * reading)
     places, which, count = np.unique(place, return_inverse=True, return_counts=True)
@@ -63,13 +64,28 @@ def balance(light: F64, reading: F64, share: F64, place: NDArray[np.int64]) -> B
     rest = ratio / mean[:, which] - 1
     scatter = np.sqrt((rest**2).sum(axis=1) / max(rest.shape[1] - len(places), 1))
     value = ratio.mean(axis=1)
-    freedom, number = len(places) - 1, ratio.shape[1]
-    by_place = float((count / number) @ (count / number))  # of the places' variance, what is left of it in the mean
-    common = 0.0
-    if freedom:
-        apart = (count * (mean / value[:, None] - 1) ** 2).sum(axis=1) - freedom * scatter**2
-        common = max(float(apart.mean()) / (number * (1.0 - by_place)), 0.0)
-    student = freedom / (freedom - 2.0) if freedom > 3 else 6.0 - freedom
-    error = np.sqrt(scatter**2 / number + student * common * by_place)
+    number = ratio.shape[1]
+    weight = 1.0 / np.maximum(scatter, 1e-6) ** 2  # light without any noise, as in a test, has a scatter of zero
+    away = weight @ (mean / value[:, None]) / weight.sum()
+    common = place_variance(away, 1.0 / (weight.sum() * count))
+    error = np.sqrt(scatter**2 / number + common * float((count / number) @ (count / number)))
     drift = (light.max(axis=1) - light.min(axis=1)) / light.mean(axis=1)
     return Balance(1.0 / value, error / value, drift, scatter)
+
+
+def place_variance(away: F64, variance: F64) -> float:
+    """Expected square of what each place is off by, as a share.
+
+    away: (P,) what was found at each place, relative to the mean; variance: (P,) of its noise. The places' standard
+    deviation has Student's half-t distribution about zero as prior (Gelman 2006), for two or three places alone hardly
+    tell it; the places' common mean is integrated out. The integral over the standard deviation is a sum.
+    """
+    spread = PLACE_SHARE * np.geomspace(1e-2, 1e3, 400)
+    total = variance + spread[:, None] ** 2
+    precision = 1.0 / total
+    mean = (precision * away).sum(axis=1) / precision.sum(axis=1)
+    likely = -0.5 * (np.log(total).sum(axis=1) + np.log(precision.sum(axis=1)))
+    likely -= 0.5 * (precision * (away - mean[:, None]) ** 2).sum(axis=1)
+    likely -= 0.5 * (PLACE_FREEDOM + 1.0) * np.log1p((spread / PLACE_SHARE) ** 2 / PLACE_FREEDOM)
+    share = np.exp(likely - likely.max()) * spread  # d(spread) = spread d(log spread)
+    return float(share @ spread**2 / share.sum())
