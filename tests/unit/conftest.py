@@ -1,5 +1,6 @@
 """Fixtures that several modules share."""
 
 from guard_fakes import laser, lasers, link, ports, run
+from reconstruct_synthetic import small
 
-__all__ = ["laser", "lasers", "link", "ports", "run"]
+__all__ = ["laser", "lasers", "link", "ports", "run", "small"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 import trimesh
 from numpy.typing import NDArray
 
@@ -78,3 +79,14 @@ def make(
     )
     truth = np.stack(truths)
     return Synthetic(samples, 0.5 * (truth + truth.transpose(0, 2, 1)))
+
+
+@pytest.fixture(scope="session")
+def small() -> Synthetic:
+    """The sphere with 80 spots; not to be changed."""
+    return make(subdivisions=2, spots=80)
+
+
+def rmse_log10(model: F64, truth: F64) -> float:
+    """Root mean square of log10(model / truth)."""
+    return float(np.sqrt((np.log10(model / truth) ** 2).mean()))

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from reconstruct_synthetic import Synthetic, make
+from reconstruct_synthetic import Synthetic, make, rmse_log10
 
 from pipeline.calibrate.fresnel import Boundary
 from pipeline.reconstruct import completion
@@ -15,39 +15,25 @@ from pipeline.reconstruct.completion import (
     RANGE_EDGES,
     SymmetricField,
     complete,
-    deviation,
     fit_laser,
     hold_measured,
     measured_entries,
 )
-from pipeline.reconstruct.dipole import dipole_reflectance, fit_dipole, fit_dipole_laser
-from pipeline.reconstruct.disco2004 import distribute, fill, neighbours, resample_2004
 from pipeline.reconstruct.harmonics import harmonics
-from pipeline.reconstruct.lambertian import fit_lambertian
 from pipeline.reconstruct.mesh import vertex_areas
 from pipeline.reconstruct.methods import METHODS, reconstruct
 from pipeline.reconstruct.needs import colour_groups, is_opaque
-from pipeline.reconstruct.profile import Measured, fit_profile, scatter
 from pipeline.reconstruct.samples import Samples
 from pipeline.reconstruct.spots import outward_tilt
 
 
-def rmse_log10(model: np.ndarray, truth: np.ndarray) -> float:
-    return float(np.sqrt((np.log10(model / truth) ** 2).mean()))
-
-
 @pytest.fixture(scope="module")
-def small():  # type: ignore[no-untyped-def]
-    return make(subdivisions=2, spots=80)
-
-
-@pytest.fixture(scope="module")
-def field(small):  # type: ignore[no-untyped-def]
+def field(small: Synthetic) -> SymmetricField:
     s = small.samples
     return SymmetricField.of(harmonics(s.mesh, 500), s.lit, 3.0)
 
 
-def test_solve_agrees_with_the_dense_normal_equations(small, field) -> None:  # type: ignore[no-untyped-def]
+def test_solve_agrees_with_the_dense_normal_equations(small: Synthetic, field: SymmetricField) -> None:
     """Rationale: the plain float64 solution of the same least squares, unknown by unknown."""
     rng = np.random.default_rng(1)
     n = 12
@@ -70,7 +56,7 @@ def test_solve_agrees_with_the_dense_normal_equations(small, field) -> None:  # 
     np.testing.assert_allclose(y, y.T)
 
 
-def test_completes_what_was_not_measured(small) -> None:  # type: ignore[no-untyped-def]
+def test_completes_what_was_not_measured(small: Synthetic) -> None:
     """Expected behaviour: entries without any sample near them come out nearly as well as measured ones."""
     model = complete(small.samples)
     r = model.reflectance[0]
@@ -85,7 +71,7 @@ def test_completes_what_was_not_measured(small) -> None:  # type: ignore[no-unty
     assert ratio.std() < 0.06
 
 
-def test_variance_covers_the_error(small) -> None:  # type: ignore[no-untyped-def]
+def test_variance_covers_the_error(small: Synthetic) -> None:
     """Expected behaviour: errors are within a few of the stated deviations, and rarely beyond."""
     model = complete(small.samples)
     z = (model.reflectance[0] - small.truth[0]) / np.sqrt(model.variance[0])
@@ -163,7 +149,7 @@ def test_noise_decides_between_sample_and_fill() -> None:
     np.testing.assert_array_equal(nothing[0][~measured], 0.09)
 
 
-def test_prior_of_the_field_has_unit_variance(small) -> None:  # type: ignore[no-untyped-def]
+def test_prior_of_the_field_has_unit_variance(small: Synthetic) -> None:
     """Rationale: draw Y from exp(-Y penalty Y / 2) over symmetric Y; G = U Y U^T is to have mean variance 1."""
     field = SymmetricField.of(harmonics(small.samples.mesh, 500), small.samples.lit, 3.0)
     rng, n = np.random.default_rng(9), len(field.penalty)
@@ -194,7 +180,7 @@ def test_the_boundary_is_compared_with_what_each_view_expects(monkeypatch: pytes
     np.testing.assert_allclose(ratio, slope * difference, atol=1e-5)
 
 
-def test_size_does_not_matter(small) -> None:  # type: ignore[no-untyped-def]
+def test_size_does_not_matter(small: Synthetic) -> None:
     """Rationale: the same object ten times as large: R_d is a hundredth. Nothing in the method is a length in mm."""
     s = small.samples
     mesh = s.mesh.copy()
@@ -207,7 +193,7 @@ def test_size_does_not_matter(small) -> None:  # type: ignore[no-untyped-def]
     np.testing.assert_allclose(100 * complete(grown).reflectance, complete(s).reflectance, rtol=0.02)
 
 
-def test_a_spot_pulls_the_model_as_far_as_its_precision_says(small, field) -> None:  # type: ignore[no-untyped-def]
+def test_a_spot_pulls_the_model_as_far_as_its_precision_says(small: Synthetic, field: SymmetricField) -> None:
     """Rationale: one spot's samples raised by half: precise, the model follows; said to be noisy, it does not."""
     s = small.samples
     spot = 11
@@ -244,109 +230,6 @@ def test_noisy_tails_do_not_bias() -> None:
     assert abs(fit) < 4 * error + 0.5 * (model.variance[0] / model.reflectance[0] ** 2)[tail].mean()
 
 
-def test_profile_is_recovered() -> None:
-    made = make(noise=0.0, contrast=0.0, hidden=0.0)
-    s = made.samples
-    profile, _ = fit_profile(s.spot_pairs, Measured.of(s, 0), float(s.mesh.edges_unique_length.mean()), s.tilt)
-    got = s.vertex_pairs.mean(profile)
-    assert rmse_log10(0.5 * (got + got.T), made.truth[0]) < 0.02
-
-
-def test_deviation_and_scatter_grow_with_distance() -> None:
-    d = np.linspace(0, 40, 50)
-    assert (np.diff(deviation(d)) >= 0).all()
-    assert (np.diff(scatter(d)) > 0).all()
-
-
-@pytest.mark.parametrize("absorption", [0.001, 0.1])
-def test_dipole_energy_and_fit(absorption: float) -> None:
-    """Rationale: the integral over the plane is Jensen's closed form; the fit returns what it was given."""
-    scattering, eta = 1.5, 1.3
-    r = np.geomspace(1e-4, 4e3, 200_000)
-    total = np.trapezoid(2 * np.pi * r * dipole_reflectance(r, scattering, absorption, eta), r)
-    inner = -1.440 / eta**2 + 0.710 / eta + 0.668 + 0.0636 * eta
-    boundary = (1 + inner) / (1 - inner)
-    albedo = scattering / (scattering + absorption)
-    root = np.sqrt(3 * (1 - albedo))
-    exact = albedo / 2 * (1 + np.exp(-4 / 3 * boundary * root)) * np.exp(-root)  # Jensen et al. 2001, eq. 15
-    assert total == pytest.approx(exact, rel=2e-3)
-    made = make(spots=40, noise=0.0, contrast=0.0, hidden=0.2)
-    kernel = made.samples.spot_pairs.mean(lambda d: dipole_reflectance(d, scattering, absorption, eta))
-    values = np.where(np.isfinite(made.samples.values), kernel, np.nan).astype(np.float32)
-    found = fit_dipole_laser(replace(made.samples, values=values), 0)
-    assert found == pytest.approx((scattering, absorption), rel=0.02)
-
-
-def test_dipole_model_depends_on_distance_alone(small) -> None:  # type: ignore[no-untyped-def]
-    model = fit_dipole(small.samples)
-    np.testing.assert_allclose(model.reflectance[0], model.reflectance[0].T, rtol=1e-6)
-
-
-def test_lambertian_albedo_is_the_energy_of_the_spots(small) -> None:  # type: ignore[no-untyped-def]
-    model = fit_lambertian(small.samples)
-    area = vertex_areas(small.samples.mesh)
-    albedo = np.diag(model.reflectance[0]) * area
-    assert np.count_nonzero(model.reflectance[0]) == len(area)
-    truth = small.truth[0] @ area
-    assert np.std(albedo / truth) < 0.08
-    assert albedo.mean() == pytest.approx(truth.mean(), rel=0.03)
-
-
-def test_baselines_are_not_misled_by_the_views(small) -> None:  # type: ignore[no-untyped-def]
-    """Rationale: samples darker by the direction that they were seen from; the fits see through it."""
-    s = make(spots=60, noise=0.0, contrast=0.0).samples
-    tilt = np.random.default_rng(4).uniform(-0.8, 0.2, s.values[0].shape)
-    leaning = replace(s, tilt=tilt, values=s.values * np.exp(0.5 * tilt).astype(np.float32))
-    np.testing.assert_allclose(
-        fit_lambertian(leaning).reflectance.sum(), fit_lambertian(s).reflectance.sum(), rtol=0.02
-    )
-    np.testing.assert_allclose(fit_dipole_laser(leaning, 0), fit_dipole_laser(s, 0), rtol=0.05)
-
-
-def test_2004_spots_count_for_their_triangles(small) -> None:  # type: ignore[no-untyped-def]
-    s = small.samples
-    one = replace(s, values=np.where(np.arange(80)[:, None] == 5, s.values, np.nan).astype(np.float32))
-    values, known = distribute(one, 0)
-    lit = s.mesh.faces[s.spots.triangle[5]]
-    assert set(np.flatnonzero(known.any(axis=1))) <= set(lit)
-    seen = np.isfinite(s.values[0, 5])
-    np.testing.assert_allclose(values[lit[0]][seen], s.values[0, 5][seen], rtol=1e-5)
-
-
-def test_2004_fill_is_where_the_iteration_ends(small) -> None:  # type: ignore[no-untyped-def]
-    """Rationale: the explicit iteration of the thesis (5.3.2), in float64 and run until it rests, with the largest
-    stable step for the shortest edge, on a mesh with edges of very different length.
-    Expected behaviour: the same matrix, symmetric, within its data, measured entries untouched; constants stay.
-    """
-    mesh = small.samples.mesh.copy()
-    mesh.vertices[:20] *= 0.999 + 0.3 * np.random.default_rng(0).random((20, 1))
-    laplacian = neighbours(np.asarray(mesh.vertices), np.asarray(mesh.edges_unique))
-    rng = np.random.default_rng(2)
-    size = len(mesh.vertices)
-    known = rng.random((size, size)) < 0.05
-    np.fill_diagonal(known, rng.random(size) < 0.5)
-    values = np.where(known, rng.random((size, size)), 0.0)
-    out = fill(values, known, laplacian)
-    count = known.astype(float) + known.T
-    iterated = np.where(count > 0, (values + values.T) / np.maximum(count, 1), 0.0)
-    step = 0.45 / laplacian.diagonal().max()
-    for _ in range(4000):
-        change = laplacian @ iterated
-        iterated = iterated - np.where(count > 0, 0.0, step * (change + change.T))
-    np.testing.assert_allclose(out, iterated, atol=5e-3)
-    np.testing.assert_allclose(out, out.T, atol=1e-5)
-    assert out.min() >= 0
-    assert out.max() <= 1
-    only = known & ~known.T
-    np.testing.assert_allclose(out[only], values[only])
-    np.testing.assert_allclose(fill(np.where(known, 0.5, 0.0), known, laplacian), 0.5, atol=5e-3)
-
-
-def test_2004_is_the_weaker_method(small) -> None:  # type: ignore[no-untyped-def]
-    theirs, ours = resample_2004(small.samples).reflectance[0], complete(small.samples).reflectance[0]
-    assert rmse_log10(np.maximum(theirs, 1e-9), small.truth[0]) > 2 * rmse_log10(ours, small.truth[0])
-
-
 def test_equal_wavelengths_are_solved_once_and_nothing_changes() -> None:
     """Rationale: leaving a wavelength out that equals another is forced on; the model is the same bits."""
     made = make(spots=40)
@@ -375,38 +258,6 @@ def test_opaque_objects_have_no_global_term() -> None:
     assert np.count_nonzero(model.reflectance[0]) == len(model.mesh.vertices)
 
 
-def test_measured_entries_come_in_pairs(small) -> None:  # type: ignore[no-untyped-def]
+def test_measured_entries_come_in_pairs(small: Synthetic) -> None:
     entries = measured_entries(small.samples)
     np.testing.assert_array_equal(entries, entries.T)
-
-
-def test_profile_is_that_of_all_directions() -> None:
-    """Rationale: samples brighter where one looks along the light's way; the tilted fit takes it out again."""
-    made = make(noise=0.0, contrast=0.0, hidden=0.0)
-    s = made.samples
-    tilt = np.random.default_rng(4).uniform(-0.8, 0.2, s.values[0].shape)
-    edge = float(s.mesh.edges_unique_length.mean())
-    seen = Measured.of(replace(s, values=s.values * np.exp(0.5 * tilt).astype(np.float32)), 0)
-    plain, tilted = (
-        s.vertex_pairs.mean(fit_profile(s.spot_pairs, seen, edge, t)[0]).sum() / made.truth[0].sum()
-        for t in (np.zeros_like(tilt), tilt)
-    )
-    assert plain < 0.9
-    assert tilted == pytest.approx(1.0, abs=0.01)
-
-
-def test_tilt_has_the_sign_of_the_view() -> None:
-    """Rationale: a camera far away along x sees the light of a spot at the pole of z along its way on the +x side."""
-    s = make(spots=2).samples
-    pole = replace(
-        s.spots,
-        position=np.array([[0, 0, 10.0]] * 2),
-        normal=np.array([[0, 0, 1.0]] * 2),
-        direction=np.array([[0, 0, -1.0], [-0.6, 0, -0.8]]),  # the second laser stands on the +x side
-    )
-    at_vertices, at_spots = outward_tilt(s.mesh, pole, np.array([1e6, 0, 0]))
-    x, _, z = np.asarray(s.mesh.vertices).T
-    near = (z > 8) & (np.abs(x) > 2)
-    np.testing.assert_array_equal(np.sign(at_vertices[0, near]), np.sign(x[near]))
-    np.testing.assert_allclose(at_spots[0, near], 0.0, atol=1e-9)
-    np.testing.assert_array_equal(np.sign(at_spots[1, near]), -np.sign(x[near]))
