@@ -102,6 +102,14 @@ def _poses(found: Found) -> Iterator[Row]:
         f"{silhouettes['edges']} edges; between {min(silhouettes['xor_px'])} and {max(silhouettes['xor_px'])} pixels "
         "a view differ from the scan's mask",
     )
+    if silhouettes["scan_error_alike_mm"]:
+        yield (
+            "the scan's own error",
+            f"{silhouettes['scan_error_mm']:.3f} mm, alike over {silhouettes['scan_error_alike_mm']:.0f} mm",
+            "as the edges show it over whole patches; it is counted in the poses' errors",
+        )
+    else:
+        yield "the scan's own error", "not known", "no two edges are near enough to each other to tell"
     for text in silhouettes["ambiguity"]:
         yield "left open", text, "the silhouettes cannot tell"
 

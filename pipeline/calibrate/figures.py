@@ -33,6 +33,7 @@ def figures(found: Measured) -> dict[str, Any]:
             "residual_px": found.poses.residual_px,
             "edges": found.poses.edges,
             "scan_error_mm": found.poses.surface_mm,
+            "scan_error_alike_mm": found.poses.surface_alike_mm,
             "xor_px": list(found.poses.xor_pixels),
             "ambiguity": list(found.poses.ambiguity),
         },

@@ -44,7 +44,8 @@ class PoseFit:
     rotation, translation: (V, 3) standard deviations of each view's pose: of the object about its own origin, in rad
     along the camera's axes, and of the origin, mm; residual_px: root mean square of the edges; edges: their number
     image_covariance: (V, 6, 6) the same rotation and translation as far as they move the object in the image, that is
-    without what the lens leaves open; surface_mm: by how much the mesh is off over whole patches, as the edges show it
+    without what the lens leaves open; surface_mm: by how much the mesh is off over whole patches, as the edges show it;
+    surface_alike_mm: over which length it is so alike, 0 where the edges do not tell
     ambiguity: directions that the silhouettes leave open, in words; empty if there is none
     xor_pixels: per view, the thesis's measure of mismatch (figure 5.1)
     axis, axis_error: (4,) of the turntable in the object frame at the first angle: rotation vector about x and y by
@@ -59,6 +60,7 @@ class PoseFit:
     edges: int
     image_covariance: F64
     surface_mm: float = 0.0
+    surface_alike_mm: float = 0.0
     ambiguity: tuple[str, ...] = ()
     xor_pixels: tuple[int, ...] = ()
     axis: F64 = field(default_factory=lambda: np.zeros(0))
@@ -283,8 +285,8 @@ def _fine(
         common = sector // (SECTORS * len(sweep.angles)) == c
         push = j[common].T @ weight[common] * (COMMON_EDGE_PX / variance)
         meat += np.outer(push, push)
-    surface, push = surface_error(j, rest - j @ step, weight / variance, length, place, inverse)
-    meat += push
+    surface = surface_error(j, rest - j @ step, weight / variance, length, place, inverse)
+    meat += surface.push
     # Lenses are held where the boards put them, but their errors are passed on (Schmidt's consider covariance).
     held = _lens_rows(sweep)
     follow = -inverse[:, ~held] @ hessian[np.ix_(~held, held)]
@@ -293,7 +295,7 @@ def _fine(
     image = inverse @ (meat + np.where(held, 0.0, precision)) @ inverse
     covariance = image + follow @ block_diag(*lens) @ follow.T
     found = _result(sweep, covariance, image, float(np.sqrt(variance)), len(rest), masks, mesh)
-    return replace(found, surface_mm=surface)
+    return replace(found, surface_mm=surface.size_mm, surface_alike_mm=surface.alike_mm)
 
 
 def _edges_of(
@@ -358,11 +360,10 @@ def _result(
         residual,
         edges,
         own_image,
-        0.0,
-        tuple(ambiguity),
-        xor,
-        sweep.axis[: len(spread)],
-        spread,
+        ambiguity=tuple(ambiguity),
+        xor_pixels=xor,
+        axis=sweep.axis[: len(spread)],
+        axis_error=spread,
     )
 
 

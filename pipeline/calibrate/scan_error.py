@@ -25,8 +25,19 @@ MOST_EDGES = 1200
 LEAST_FREEDOM = 3.0  # with fewer Student's factor grows without bound; three times the variance was enough for 2 to 3
 
 
-def surface_error(j: F64, rest: F64, weight: F64, length: F64, place: F64, inverse: F64) -> tuple[float, F64]:
-    """The patches' error in mm, and the (P, P) covariance of the fit's gradient that it causes.
+@dataclass(frozen=True)
+class SurfaceError:
+    """size_mm: by how much the scan is off; alike_mm: over which length it is so alike, 0 where nothing is known;
+    push: (P, P) covariance of the fit's gradient that it causes.
+    """
+
+    size_mm: float
+    alike_mm: float
+    push: F64
+
+
+def surface_error(j: F64, rest: F64, weight: F64, length: F64, place: F64, inverse: F64) -> SurfaceError:
+    """The patches' error.
 
     j: (K, P), rest: (K,) pixels that the fit leaves, weight: (K,) 1/pixels^2, length: (K,) pixels of outline, place:
     (K, 4) object frame, mm, and pixels per mm, inverse: (P, P) of the fit's precision.
@@ -51,7 +62,7 @@ def surface_error(j: F64, rest: F64, weight: F64, length: F64, place: F64, inver
         near = (apart > NEAR_MM) & (apart < millimetres)
         if near.any():
             forms = np.diag(length), np.outer(length, length) * alike * near
-            found = _Patches.of(rest, (white, left(alike)), forms, alike, _thinned(apart))
+            found = _Patches.of(rest, (white, left(alike)), forms, alike, millimetres, _thinned(apart))
             best = found if best is None or found.likelihood > best.likelihood else best
     if best is None:
         log.warning(
@@ -60,26 +71,28 @@ def surface_error(j: F64, rest: F64, weight: F64, length: F64, place: F64, inver
             NEAR_MM,
             LENGTHS_MM[-1],
         )
-        return 0.0, np.zeros_like(inverse)
+        return SurfaceError(0.0, 0.0, np.zeros_like(inverse))
     push = j.T @ (weight[:, None] * best.alike * weight) @ j
-    return float(np.sqrt(best.variance)), best.variance * best.student * push
+    return SurfaceError(float(np.sqrt(best.variance)), best.alike_mm, best.variance * best.student * push)
 
 
 @dataclass(frozen=True)
 class _Patches:
     """Errors that are alike over one length: variance in mm^2, Student's factor of it, (K, K) alike in pixels per mm
-    squared, and the logarithm of how likely what is left is with them.
+    squared, that length in mm, and the logarithm of how likely what is left is with them.
     """
 
     variance: float
     student: float
     alike: F64
+    alike_mm: float
     likelihood: float
 
     @classmethod
     def of(
-        cls, rest: F64, kinds: tuple[F64, F64], forms: tuple[F64, F64], alike: F64, some: NDArray[np.int64]
-    ) -> _Patches:
+        cls, rest: F64, kinds: tuple[F64, F64], forms: tuple[F64, F64], alike: F64, alike_mm: float,
+        some: NDArray[np.int64],
+    ) -> _Patches:  # fmt: skip
         """rest: (K,) pixels; kinds: (K, K) what is left of both errors; forms: (K, K); some: (S,) places that share no
         edge's own error, for the likelihood.
         """
@@ -93,7 +106,7 @@ class _Patches:
             _likelihood(rest[some], kinds[0][np.ix_(some, some)] * own + kinds[1][np.ix_(some, some)] * factor * common)
             for factor in FACTORS
         )
-        return cls(common, freedom / (freedom - 2.0), alike, likelihood)
+        return cls(common, freedom / (freedom - 2.0), alike, alike_mm, likelihood)
 
 
 def _likelihood(rest: F64, covariance: F64) -> float:

@@ -21,26 +21,29 @@ def outlines() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("length_mm", [5.0, 10.0, 20.0])
 def test_the_scans_error_and_what_it_does_are_known(length_mm: float) -> None:
-    """Expected: .1 mm that is alike over a length that nobody tells is found although the fit takes half of it for
-    motion; with white errors alone none is found. z-scores of 60 fits have a root mean square between .8 and 1.25.
+    """Expected: .1 mm that is alike over a length that nobody tells is found, mostly with its length, although the fit
+    takes half of it for motion; with white errors alone none is found. z-scores of 60 fits have a root mean square
+    between .8 and 1.25.
     """
     rng = np.random.default_rng(0)
     place, j = outlines()
     apart = np.linalg.norm(place[:, None, :3] - place[None, :, :3], axis=2)
     root = np.linalg.cholesky(np.exp(-((apart / length_mm) ** 2)) + 1e-9 * np.eye(360))
     weight, inverse = np.full(360, 0.3**-2), np.linalg.inv(j.T @ j / 0.3**2)
-    found, scores, white = [], [], []
+    found, scores, white, alike = [], [], [], []
     for _ in range(60):
         noise = 0.02 * rng.standard_normal(360)
         error = 0.1 * SCALE * root @ rng.standard_normal(360) + noise
         for edges, sizes in ((error, found), (noise, white)):
             step = inverse @ (j.T @ (weight * edges))
-            size, push = surface_error(j, edges - j @ step, weight, np.ones(360), place, inverse)
-            sizes.append(size)
+            scan = surface_error(j, edges - j @ step, weight, np.ones(360), place, inverse)
+            sizes.append(scan.size_mm)
             if edges is error:
-                scores.append(step / np.sqrt(np.diag(inverse @ push @ inverse)))
+                scores.append(step / np.sqrt(np.diag(inverse @ scan.push @ inverse)))
+                alike.append(scan.alike_mm)
     assert abs(np.sqrt(np.mean(np.square(found))) - 0.1) < 0.01
     assert max(white) < 0.005
+    assert np.median(alike) == length_mm
     assert 0.8 < np.sqrt(np.mean(np.square(scores))) < 1.25
     assert np.std(scores, axis=0).min() > 0.6
 
@@ -56,9 +59,9 @@ def test_what_is_hardly_known_has_a_wide_error() -> None:
     for _ in range(100):
         error = 0.1 * SCALE * root @ rng.standard_normal(120) + 0.02 * rng.standard_normal(120)
         step = inverse @ (j.T @ (weight * error))
-        size, push = surface_error(j, error - j @ step, weight, np.ones(120), place, inverse)
-        if size > 0:
-            scores.append(step / np.sqrt(np.diag(inverse @ push @ inverse)))
+        scan = surface_error(j, error - j @ step, weight, np.ones(120), place, inverse)
+        if scan.size_mm > 0:
+            scores.append(step / np.sqrt(np.diag(inverse @ scan.push @ inverse)))
     assert len(scores) > 90
     assert 0.6 < np.sqrt(np.mean(np.square(scores))) < 1.25
 
@@ -69,7 +72,7 @@ def test_edges_that_say_nothing_of_patches(larger: float, caplog: pytest.LogCapt
     place, j = (x[:: 1 if larger < 1 else 6] for x in outlines())
     place[:, :3] *= larger
     weight, inverse = np.full(len(place), 0.3**-2), np.linalg.inv(j.T @ j / 0.3**2)
-    size, push = surface_error(j, 0.05 * np.ones(len(place)), weight, np.ones(len(place)), place, inverse)
-    assert size == 0.0
-    assert not push.any()
+    scan = surface_error(j, 0.05 * np.ones(len(place)), weight, np.ones(len(place)), place, inverse)
+    assert scan.size_mm == scan.alike_mm == 0.0
+    assert not scan.push.any()
     assert "apart" in caplog.text

@@ -170,7 +170,14 @@ MEASURED = {
         "power_drift": [0.35],
         "power_scatter": [0.0088],
     },
-    "silhouettes": {"residual_px": 0.037, "edges": 2380, "xor_px": [16, 30], "ambiguity": ["rotation about <z>"]},
+    "silhouettes": {
+        "residual_px": 0.037,
+        "edges": 2380,
+        "scan_error_mm": 0.0645,
+        "scan_error_alike_mm": 10.0,
+        "xor_px": [16, 30],
+        "ambiguity": ["rotation about <z>"],
+    },
     "poses": [{"camera": "front", "rotation_error_deg": 0.087, "across_error_mm": 0.43, "depth_error_mm": 0.86}],
     "axis": {
         "tilt_deg": [-0.011, 0.013],
@@ -206,6 +213,7 @@ def test_the_calibration_is_told_with_its_uncertainty() -> None:
         "drifted by 35%",
         "+- 0.43 mm across, +- 0.86 mm along the axis, +- 0.087 deg",
         "tilt -0.011 +- 0.015, 0.013 +- 0.012 deg",
+        "0.065 mm, alike over 10 mm",
         "rotation about &lt;z&gt;",
         "86 used, 91 hidden, 3 false",
         "+- 0.033 mm",
@@ -213,5 +221,7 @@ def test_the_calibration_is_told_with_its_uncertainty() -> None:
     ):
         assert shown in body
     assert "axis</td><td class='text'>tilt" not in section(MEASURED | {"axis": None}, [635.0])[1]
+    untold = MEASURED | {"silhouettes": MEASURED["silhouettes"] | {"scan_error_mm": 0.0, "scan_error_alike_mm": 0.0}}
+    assert "own error</td><td class='text'>not known" in section(untold, [635.0])[1]
     assert section({"source": "nominal"}, [635.0])[1] == ""
     assert "given as a file" in section({"source": "given"}, [635.0])[0]
