@@ -9,7 +9,7 @@ import pytest
 
 from disco_twin.camera.lars3 import Lars3, lars3_sensor
 from disco_twin.camera.sensor import expected_variance
-from disco_twin.noise import RADIANCES, measured_noise, splat, walks_below_camera
+from disco_twin.noise import measured_noise, splat, walks_below_camera
 from disco_twin.predict import predict
 from disco_twin.scene import Scene, load_scene
 from disco_twin.world import World
@@ -40,19 +40,41 @@ def test_expected_variance_is_that_of_exposures(scene: Scene, radiance: float) -
     assert found == pytest.approx(expected, rel=5 * np.sqrt(2 / 20_000))
 
 
-def test_more_light_in_a_splat_asks_for_more_walks(scene: Scene) -> None:
-    """Expected behaviour: the simulation's variance s P L / N is below the camera's everywhere at the N that is
-    stated, and not at half of it; a smoother boundary asks for more.
+def test_the_walks_that_are_stated_bury_the_simulations_noise(scene: Scene) -> None:
+    """Rationale: splats of one size drawn as they fall, Poisson, and photographed by the twin's camera, against the
+    same radiance without noise.
+
+    Expected behaviour: with the walks that are stated the two noises are equal at the worst radiance, so the variance
+    is twice the camera's there and less everywhere else; with half the walks it is three times.
     """
-    sensor, s, walks = lars3_sensor(scene.rig), splat(scene), walks_below_camera(scene)
-    worst = [
-        (laser.power_mw * 1e-3 * s * RADIANCES / walks / expected_variance(RADIANCES, sensor, k)).max()
-        for k, laser in enumerate(scene.rig.lasers)
-    ]
-    assert max(worst) == pytest.approx(1.0)
+    sensor, rng = lars3_sensor(scene.rig), np.random.default_rng(5)
+    camera, watts = Lars3(sensor, np.ones((100, 200), np.float32)), scene.rig.lasers[0].power_mw * 1e-3
+    one = scene.model_copy(update={"rig": scene.rig.model_copy(update={"lasers": scene.rig.lasers[:1]})})
+
+    def spread(image: np.ndarray) -> float:
+        seen = camera.expose(image.astype(np.float32), 0, rng)
+        return float(to_radiance(seen, sensor, 0).radiance.astype(float).var())
+
+    def worst(walks: float) -> float:
+        size = watts * splat(one) / walks  # radiance that a walk adds to the pixel that it meets
+        levels = np.geomspace(1e-11, 2e-5, 40)
+        return max(
+            spread(size * rng.poisson(level / size, (100, 200))) / spread(np.full((100, 200), level))
+            for level in levels
+        )
+
+    walks = walks_below_camera(one)
+    assert worst(walks) == pytest.approx(2.0, rel=0.1)
+    assert worst(walks / 2) == pytest.approx(3.0, rel=0.1)
+
+
+def test_smoother_boundaries_and_many_cameras_ask_for_more_walks(scene: Scene) -> None:
+    """Expected behaviour: in proportion to the splat, whose size is measured in tests/validation/test_estimators.py."""
+    walks = walks_below_camera(scene)
     smooth = scene.object.boundary.model_copy(update={"alpha": 0.05})
     smoother = scene.model_copy(update={"object": scene.object.model_copy(update={"boundary": smooth})})
-    assert walks_below_camera(smoother) > 2 * walks
+    assert walks_below_camera(smoother) / walks == pytest.approx(splat(smoother) / splat(scene))
+    assert splat(smoother) > 2 * splat(scene)
     crowd = scene.model_copy(update={"rig": scene.rig.model_copy(update={"cameras": scene.rig.cameras * 12})})
     assert walks_below_camera(crowd) == pytest.approx(4 * walks)
 
