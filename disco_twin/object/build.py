@@ -21,7 +21,10 @@ __all__ = ["Boundary", "Medium", "TwinObject", "build_object", "build_scan", "ha
 
 @dataclass(frozen=True)
 class Boundary:
-    """Rough (GGX, `alpha`) or smooth dielectric of relative index `eta`; matched: no boundary, eta = 1."""
+    """Rough (GGX, `alpha`) or smooth dielectric of relative index `eta`; matched: no boundary, eta = 1.
+
+    Smooth is for what is known exactly of energy: its images are black, which no scene may ask for.
+    """
 
     kind: Literal["rough", "smooth", "matched"]
     eta: float

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from disco_twin.object.materials import MATERIALS
 from pipeline.config import NearbyFile, Strict
@@ -79,9 +79,16 @@ Shape = Annotated[MeshFile | Pebble | Sphere | Box | Torus, Field(discriminator=
 class BoundaryConfig(Strict):
     """Surface of the object: a dielectric of index `eta`, microfacet roughness `alpha` (GGX), or no boundary at all."""
 
-    kind: Literal["rough", "smooth", "matched"] = "rough"
+    kind: Literal["rough", "matched"] = "rough"
     eta: Annotated[float, Field(ge=1, le=3)] = 1.3
     alpha: Annotated[float, Field(ge=0.02, le=1)] = 0.3
+
+    @field_validator("kind", mode="before")
+    @classmethod
+    def _seen_by_a_camera(cls, kind: object) -> object:
+        if kind == "smooth":
+            raise ValueError("no walk connects to a camera through a smooth boundary; take 'rough' with alpha = 0.02")
+        return kind
 
 
 # ---------------------------------------------------------------- medium: what fills the object before features

@@ -68,7 +68,12 @@ BAD = [
     (
         "[scan]",
         '[object.boundary]\nkind = "shiny"\n[scan]',
-        ["object.boundary.kind = 'shiny'", "rough, smooth, matched"],
+        ["object.boundary.kind = 'shiny'", "rough, matched"],
+    ),
+    (
+        "[scan]",
+        '[object.boundary]\nkind = "smooth"\n[scan]',
+        ["object.boundary.kind = 'smooth'", "camera", "'rough' with alpha = 0.02"],
     ),
     ("[scan]", '[relight]\nlights = ["moon"]\n[scan]', ["relight.lights", "unknown light 'moon'", "uniform"]),
     ("[scan]", '[[relight.lights]]\nkind = "uniform"\ncolour = [1.0]\n[scan]', ["relight.lights", "3 values"]),

@@ -242,13 +242,15 @@ def test_projection_is_the_cameras() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "alpha", "g"), [("rough", 0.3, 0.0), ("rough", 0.05, 0.0), ("rough", 0.25, 0.8), ("matched", 0.0, 0.4)]
+    ("kind", "alpha", "g"),
+    [("rough", 0.3, 0.0), ("rough", 0.05, 0.0), ("rough", 0.02, 0.0), ("rough", 0.25, 0.8), ("matched", 0.0, 0.4)],
 )
 def test_a_walk_adds_a_splat_of_known_radiance(kind: str, alpha: float, g: float) -> None:
     """Rationale: `disco-twin plan` says from it how many walks a scene takes.
 
     Expected behaviour: variance of a pixel x walks / mean, between replicates, is within a factor of two (three
-    where light scatters forward) of `splat_share`, in each of the three decades below the brightest pixel.
+    where light scatters forward or the boundary is as smooth as a scene may have it) of `splat_share`, in each of the
+    three decades below the brightest pixel.
     """
     view = camera(VIEWS[0], 13.0, 48)
     walks, replicates = 4_000, 64
@@ -258,7 +260,7 @@ def test_a_walk_adds_a_splat_of_known_radiance(kind: str, alpha: float, g: float
     found = images[:, 0, 0, 0].astype(float)
     mean, variance = found.mean(axis=0), found.var(axis=0, ddof=1)
     unit = float(view.focal.prod() / (view.position @ view.position))
-    within = 2.0 if g < 0.5 else 3.0
+    within = 2.0 if g < 0.5 and alpha != 0.02 else 3.0
     for decade in range(3):
         part = (mean <= mean.max() * 10.0**-decade) & (mean > mean.max() * 10.0 ** -(decade + 1))
         assert part.sum() >= 5
