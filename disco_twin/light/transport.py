@@ -235,6 +235,7 @@ class Transport:
                 for name in EnergyBalance.__dataclass_fields__
             }
         )
+        balance.warn_of_loss()
         return Traced(join("images", 3), join("variance", 3), join("deposits", 1), balance)
 
     def _trace_group(

@@ -45,7 +45,7 @@ from disco_twin.light.tables import (
 )
 
 INNER = 8  # collisions per outer step
-MAX_STEPS = 1 << 18  # outer steps after which a photon is counted as still inside
+MAX_STEPS = 1 << 18  # intersection tests after which a photon, or a copy of one, is cut off: its power is `inside`
 
 
 def deposit(t: Tables, deposits: Any, tag: Any, si: Any, weight: Any, rng: Rng, ok: Any) -> None:
@@ -73,7 +73,7 @@ class Balance:
     absorbed: Any
     boundary: Any  # lost by the single-scatter rough boundary
     roulette: Any  # created (or destroyed) by Russian roulette; zero in the mean
-    inside: Any  # still inside when a photon was cut off, or leaked through a mesh that is not watertight
+    inside: Any  # still inside when cut off after MAX_STEPS, or leaked through a mesh that is not watertight
 
 
 @dataclass
@@ -224,7 +224,7 @@ def fly(
             sums.reflected += wide(dr.select(photon.entered, 0.0, photon.w))
             sums.escaped += wide(dr.select(photon.entered, photon.w, 0.0))
             photon.alive = mi.Bool(False)
-    cut = photon.alive & (photon.steps > MAX_STEPS)
+    cut = photon.alive & photon.inside & (photon.steps > MAX_STEPS)  # outside it has been counted by the deposits
     sums.inside += wide(dr.select(cut, photon.w, 0.0))
     photon.alive &= ~cut
     return photon, reservoir, sums, rng

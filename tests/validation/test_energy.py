@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from significance import assert_z, z_of_replicates
 from twins import beam, block, camera, escaped, twin
 
+from disco_twin.light import walk
 from disco_twin.light.sources import HatSource, light_source
 from disco_twin.light.transport import EnergyBalance, Transport
 from disco_twin.object.build import Boundary, Medium, TwinObject
@@ -246,6 +247,28 @@ def test_albedo_zero() -> None:
     power, _ = escaped(Transport(twin(block(40.0, 0.7), "matched", 1.0, 1.0, [0.0])), beam(), 1, 200_000, seed=52)
     share = math.exp(-np.float32(0.7))
     assert_z((power[0, 0] - share) / math.sqrt(share * (1 - share) / 200_000), "e^-tau")
+
+
+def test_photons_that_are_cut_off_are_counted_and_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Rationale: a walk ends after MAX_STEPS meetings with the surface, here after three, whatever it still carries.
+
+    Expected behaviour: what left, plus what is counted as inside, is what was launched, and one line says how much is
+    lost; with the shipped limit nothing is, and nothing is said.
+    """
+    transport = Transport(twin(block(20.0, 5.0), "smooth", 1.5, 2.0, [1.0]))
+    whole = transport.trace(beam(), 1, 20_000, seed=59, deposit=True)
+    assert whole.balance.inside[0] == 0
+    assert not caplog.records
+    monkeypatch.setattr(walk, "MAX_STEPS", 3)
+    cut = transport.trace(beam(), 1, 20_000, seed=59, deposit=True)
+    assert cut.deposits is not None
+    lost = cut.balance.inside[0]
+    assert lost > 0.05
+    assert np.abs(cut.balance.residual).max() < 1e-6
+    assert cut.deposits.sum() + cut.balance.reflected[0] + lost == pytest.approx(1.0, abs=1e-5)
+    assert f"{lost:.2g} of the launched power is lost" in caplog.text
 
 
 def test_albedo_one() -> None:
