@@ -134,6 +134,28 @@ def test_fluence_solves_the_diffusion_equation() -> None:
     assert estimate.fluence(other[None])[0][16, 16, 16] == pytest.approx(fluence[5, 10, 20], rel=1e-9)
 
 
+def test_effort_ends_where_the_light_is_darkest() -> None:
+    """Rationale: a large dark body, whose fluence falls by 15 to 20 decades. Down to 1e-5 of the peak photons are to be
+    as dense as in the light; where nothing was asked for they must not take the effort.
+
+    Expected behaviour: collisions in cells whose light is split at all are equal within the targets' steps down to 1e-5
+    (a limit at 1e-3 leaves a factor of a hundred), and those below 3e-6 are less than a third of all
+    (without a limit two thirds to nine tenths of the effort goes there), and still fainter cells are met the less.
+    """
+    for albedo, effort in ((0.9, 3.0), (0.9, 30.0), (0.95, 3.0)):
+        estimate = diffusion(twin(block(60.0, 60.0), "matched", 1.0, 1.0, [albedo]), 0)
+        fluence = estimate.fluence([[0.0, 0.0, -1.0]])
+        target = window_targets(fluence, estimate.filled, effort)[0][estimate.filled]
+        light = fluence[0][estimate.filled]
+        met, share = light / target, light / light.max()
+        assert share.min() < 1e-14
+        split = (share > 1e-5) & (target < 1)
+        assert split.sum() > 1000
+        assert met[split].max() / met[split].min() < 1.3
+        assert met[share < 3e-6].sum() < met.sum() / 3
+        assert met[share < 1e-9].max() < 0.01 * met[split].min()
+
+
 def test_targets_spend_the_effort() -> None:
     """Expected: sum of max(fluence, f) = effort * sum of fluence over the filled cells, targets = min(1, fluence / f);
     an effort that is out of reach evens everything out; no cell is far below its neighbours.
