@@ -32,7 +32,7 @@ from pipeline.calibrate.calibration import (
 from pipeline.calibrate.camera import PinholeCamera, turn
 from pipeline.calibrate.intrinsics import Intrinsics, board_pose, find_corners, fit_intrinsics
 from pipeline.calibrate.peaks import Peak, brightness, find_peak, footprint, seen
-from pipeline.calibrate.photometric import Balance, balance, pixel_areas
+from pipeline.calibrate.photometric import Balance, balance, pixel_areas, with_places
 from pipeline.calibrate.place import nominal_projector, with_pose_error
 from pipeline.calibrate.pose import PoseFit, fit_poses
 from pipeline.calibrate.projector import TwoMirrorProjector
@@ -86,6 +86,8 @@ def measure(capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh
     if response is not None:
         sensor = replace(sensor, response=tuple(float(x) for x in response.exposure))
     cameras = [read_targets(capture / FOLDER / c.name, rig, i, sensor) for i, c in enumerate(rig.cameras)]
+    whites = with_places([c.balance for c in cameras])
+    cameras = [replace(camera, balance=white) for camera, white in zip(cameras, whites, strict=True)]
     angles = [float(a) for a in np.deg2rad(rig.turntable_angles_deg)]
     with StreamReader(capture) as stream:
         stream.require_complete()

@@ -7,7 +7,8 @@ nor a mode hop matters, and what remains is one factor per camera and laser.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,19 @@ from pipeline.calibrate.camera import PinholeCamera
 
 F64 = NDArray[np.float64]
 
-PLACE_SHARE = 5e-4  # tan(45 degrees) times what a board's tilt is known to: by this much the plate's area errs
-PLACE_FREEDOM = 2.0  # few: places that do differ by far more than that are believed
+PLACE_SHARE = 2e-4  # a board's corners tell its plane's area to about this
+PLACE_FREEDOM = 1.5  # few: places that do differ by far more than that are believed
+
+
+@dataclass(frozen=True)
+class Places:
+    """The places of the plate before one camera: what was found at each, (P,) relative to the mean of all exposures and
+    with all lasers together; variance: (P,) of its noise; weight: (P,) share of the exposures.
+    """
+
+    found: F64
+    variance: F64
+    weight: F64
 
 
 @dataclass(frozen=True)
@@ -29,12 +41,15 @@ class Balance:
 
     drift: (L,) (largest - smallest) / mean of the plate's light over the whole time; scatter: (L,) standard deviation
     of the same after division by the photodiode, exposure by exposure (speckle on the plate included)
+
+    places: `with_places` adds to the error what the plate's places differ by; until then it is speckle's alone.
     """
 
     factor: F64
     error: F64
     drift: F64
     scatter: F64
+    places: Places
 
 
 def pixel_areas(camera: PinholeCamera, plane: F64) -> F64:
@@ -55,8 +70,7 @@ def balance(light: F64, reading: F64, share: F64, place: NDArray[np.int64]) -> B
 
     place: (N,) which exposures were made in one place of the plate; a plate's pose errs for all of them alike
 
-    Exposures of one place scatter by speckle; places differ by more than that, alike for all lasers, as far as the
-    plate's poses err (`place_variance`).
+    Exposures of one place scatter by speckle, which the error is of.
     """
     ratio = np.pi * light / (share[:, None] * reading)
     places, which, count = np.unique(place, return_inverse=True, return_counts=True)
@@ -66,26 +80,32 @@ def balance(light: F64, reading: F64, share: F64, place: NDArray[np.int64]) -> B
     value = ratio.mean(axis=1)
     number = ratio.shape[1]
     weight = 1.0 / np.maximum(scatter, 1e-6) ** 2  # light without any noise, as in a test, has a scatter of zero
-    away = weight @ (mean / value[:, None]) / weight.sum()
-    common = place_variance(away, 1.0 / (weight.sum() * count))
-    error = np.sqrt(scatter**2 / number + common * float((count / number) @ (count / number)))
+    found = Places(weight @ (mean / value[:, None]) / weight.sum(), 1.0 / (weight.sum() * count), count / number)
     drift = (light.max(axis=1) - light.min(axis=1)) / light.mean(axis=1)
-    return Balance(1.0 / value, error / value, drift, scatter)
+    return Balance(1.0 / value, scatter / (np.sqrt(number) * value), drift, scatter, found)
 
 
-def place_variance(away: F64, variance: F64) -> float:
+def with_places(balances: Sequence[Balance]) -> list[Balance]:
+    """The white balances of all cameras, their errors with that of the plate's poses: that one is alike for all exposures
+    and lasers of a place, and has one standard deviation for all places and cameras.
+    """
+    share = place_variance([b.places for b in balances])
+    own = [share * float(b.places.weight @ b.places.weight) for b in balances]
+    return [replace(b, error=np.hypot(b.error, np.sqrt(v) * b.factor)) for b, v in zip(balances, own, strict=True)]
+
+
+def place_variance(cameras: Sequence[Places]) -> float:
     """Expected square of what each place is off by, as a share.
 
-    away: (P,) what was found at each place, relative to the mean; variance: (P,) of its noise. The places' standard
-    deviation has Student's half-t distribution about zero as prior (Gelman 2006), for two or three places alone hardly
-    tell it; the places' common mean is integrated out. The integral over the standard deviation is a sum.
+    The places' standard deviation has Student's half-t distribution about zero as prior (Gelman 2006), for a few places
+    alone hardly tell it; every camera's mean is integrated out. The integral over the standard deviation is a sum.
     """
     spread = PLACE_SHARE * np.geomspace(1e-2, 1e3, 400)
-    total = variance + spread[:, None] ** 2
-    precision = 1.0 / total
-    mean = (precision * away).sum(axis=1) / precision.sum(axis=1)
-    likely = -0.5 * (np.log(total).sum(axis=1) + np.log(precision.sum(axis=1)))
-    likely -= 0.5 * (precision * (away - mean[:, None]) ** 2).sum(axis=1)
-    likely -= 0.5 * (PLACE_FREEDOM + 1.0) * np.log1p((spread / PLACE_SHARE) ** 2 / PLACE_FREEDOM)
+    likely = -0.5 * (PLACE_FREEDOM + 1.0) * np.log1p((spread / PLACE_SHARE) ** 2 / PLACE_FREEDOM)
+    for places in cameras:
+        precision = 1.0 / (places.variance + spread[:, None] ** 2)
+        mean = (precision * places.found).sum(axis=1) / precision.sum(axis=1)
+        likely += 0.5 * (np.log(precision).sum(axis=1) - np.log(precision.sum(axis=1)))
+        likely -= 0.5 * (precision * (places.found - mean[:, None]) ** 2).sum(axis=1)
     share = np.exp(likely - likely.max()) * spread  # d(spread) = spread d(log spread)
     return float(share @ spread**2 / share.sum())
