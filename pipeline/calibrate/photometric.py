@@ -86,8 +86,9 @@ def balance(light: F64, reading: F64, share: F64, place: NDArray[np.int64]) -> B
 
 
 def with_places(balances: Sequence[Balance]) -> list[Balance]:
-    """The white balances of all cameras, their errors with that of the plate's poses: that one is alike for all exposures
-    and lasers of a place, and has one standard deviation for all places and cameras.
+    """The white balances of all cameras, their errors with that of the plate's poses.
+
+    That one is alike for all exposures and lasers of a place, and of one standard deviation for all places and cameras.
     """
     share = place_variance([b.places for b in balances])
     own = [share * float(b.places.weight @ b.places.weight) for b in balances]
