@@ -102,7 +102,7 @@ def _poses(found: Found) -> Iterator[Row]:
         f"{silhouettes['edges']} edges; between {min(silhouettes['xor_px'])} and {max(silhouettes['xor_px'])} pixels "
         "a view differ from the scan's mask",
     )
-    if silhouettes["scan_error_alike_mm"]:
+    if silhouettes.get("scan_error_alike_mm"):  # runs of earlier versions lack it
         yield (
             "the scan's own error",
             f"{silhouettes['scan_error_mm']:.3f} mm, alike over {silhouettes['scan_error_alike_mm']:.0f} mm",

@@ -223,5 +223,9 @@ def test_the_calibration_is_told_with_its_uncertainty() -> None:
     assert "axis</td><td class='text'>tilt" not in section(MEASURED | {"axis": None}, [635.0])[1]
     untold = MEASURED | {"silhouettes": MEASURED["silhouettes"] | {"scan_error_mm": 0.0, "scan_error_alike_mm": 0.0}}
     assert "own error</td><td class='text'>not known" in section(untold, [635.0])[1]
+    earlier = {
+        k: v for k, v in MEASURED["silhouettes"].items() if k != "scan_error_alike_mm"
+    }  # a run made before it was
+    assert "own error</td><td class='text'>not known" in section(MEASURED | {"silhouettes": earlier}, [635.0])[1]
     assert section({"source": "nominal"}, [635.0])[1] == ""
     assert "given as a file" in section({"source": "given"}, [635.0])[0]
