@@ -21,13 +21,13 @@ from hw.devices.elliptec import BAUD as ELLIPTEC_BAUD
 from hw.devices.elliptec import ElliptecTable
 from hw.devices.mm_ard import BAUD as BOARD_BAUD
 from hw.devices.mm_ard import LINES, MirrorBoard
-from hw.devices.omicron import OmicronLaser
+from hw.devices.omicron import OFF_SHARE, OmicronLaser
 from hw.devices.ophir import BAUD as OPHIR_BAUD
 from hw.devices.ophir import OphirMeter
 from hw.devices.turning import Table
 from hw.devices.zaber import BAUD as ZABER_BAUD
 from hw.devices.zaber import ZaberTable
-from hw.errors import DeviceFault, InputError
+from hw.errors import DeviceError, DeviceFault, InputError
 from hw.interface import Camera
 from hw.rig import SerialRig
 from hw.serial_link import Link
@@ -50,28 +50,67 @@ class Connector:
         self._follow = file.simulated_cameras
         self._urls = {} if emulation is None else emulation.attach()
 
-    def link(self, port: str, baud: int, device: str, name: str, guarded: bool = False) -> Link:
-        """A device's link. `name` is that of its emulated line and of its byte log."""
-        if port == EMULATED:
-            url = self._urls[name]
-        else:
-            url = f"guard://{port}" if guarded else port
-        return Link(url, baud, device, self.clock, None if self.logs is None else ByteLog(self.logs / f"{name}.log"))
+    def _opened(
+        self, key: str, baud: int, device: str, name: str, driver: Callable[[Link], T], guarded: bool = False
+    ) -> T:
+        """A driver on the link to its port, which is closed if the driver refuses the device.
+
+        key: of the port in the rig file; name: of the device's emulated line and of its byte log
+        """
+        port = self.file.ports()[key]
+        url = self._urls[name] if port == EMULATED else f"guard://{port}" if guarded else port
+        try:
+            link = Link(
+                url, baud, device, self.clock, None if self.logs is None else ByteLog(self.logs / f"{name}.log")
+            )
+            try:
+                return driver(link)
+            except BaseException:
+                link.close()
+                raise
+        except DeviceError as error:
+            if port == EMULATED:
+                raise
+            named = error.set_by(key, port)
+            raise (named if self.file.path is None else named.within(self.file.path)) from error.__cause__
 
     def omicron(self, index: int) -> OmicronLaser:
         """A laser's driver; connecting switches it off."""
         device = self.file.lasers[index]
         name = f"laser {device.wavelength_nm:g} nm"
-        link = self.link(device.port, device.baud, name, f"laser{index}", guarded=True)
-        return _opened(link, lambda: OmicronLaser(link, device.wavelength_nm))
+
+        def driver(link: Link) -> OmicronLaser:
+            head = OmicronLaser(link, device.wavelength_nm)
+            self._require_settable(index, head)
+            return head
+
+        return self._opened(f"lasers[{index}].port", device.baud, name, f"laser{index}", driver, guarded=True)
+
+    def _require_settable(self, index: int, head: OmicronLaser) -> None:
+        """Refuse a power that this laser cannot be set to: one in watts or microwatts, or another laser's."""
+        top, power_mw = head.identity.max_power_mw, self.file.lasers[index].power_mw
+        if OFF_SHARE * top < power_mw <= top * (1.0 + 1e-9):
+            return
+        problem = f"{head.name} ({head.identity.model}) says that its maximum is {top:g} mW"
+        remedy = "give the power in mW"
+        if power_mw < top:
+            problem += f", and takes {100 * OFF_SHARE:g} % of it for darkness"
+            remedy += f" ({1e3 * power_mw:g}, if this is in W)" if 1e3 * power_mw <= top else ""
+        raise InputError(
+            problem,
+            file=self.file.path,
+            key=f"lasers[{index}].power_mw",
+            value=power_mw,
+            allowed=f"more than {OFF_SHARE * top:g}, at most {top:g}",
+            remedy=remedy,
+        )
 
     def meter(self) -> OphirMeter:
         """The power meter's driver."""
-        device = self.file.power_meter
-        if device is None:
-            raise InputError("the rig file has no power meter", key="power_meter")
-        link = self.link(device.port, OPHIR_BAUD, "power meter", "power_meter")
-        return _opened(link, lambda: OphirMeter(link))
+        if self.file.power_meter is None:
+            remedy = "add the table [power_meter]"
+            raise InputError("the rig file has no power meter", file=self.file.path, key="power_meter", remedy=remedy)
+        return self._opened("power_meter.port", OPHIR_BAUD, "power meter", "power_meter", OphirMeter)
 
     def laser(self, index: int) -> Head:
         """A laser as the rig uses it."""
@@ -83,8 +122,8 @@ class Connector:
     def board(self) -> Board:
         """The board's driver; connecting shuts every line."""
         device = self.file.board
-        link = self.link(device.port, BOARD_BAUD, "mirror board", "board")
-        board, limits = _opened(link, lambda: MirrorBoard(link)), (device.limits_u, device.limits_v)
+        board = self._opened("board.port", BOARD_BAUD, "mirror board", "board", MirrorBoard)
+        limits = (device.limits_u, device.limits_v)
         if device.port == EMULATED or not self._follow or self.emulation is None:
             return LimitedBoard(board, limits)
         return FollowedBoard(board, limits, self.emulation.bench)
@@ -93,14 +132,13 @@ class Connector:
         """The turntable's driver."""
         device = self.file.turntable
         baud = ZABER_BAUD if isinstance(device, ZaberDevice) else ELLIPTEC_BAUD
-        link = self.link(device.port, baud, "turntable", "turntable")
 
-        def driver() -> Table:
+        def driver(link: Link) -> Table:
             if isinstance(device, ZaberDevice):
                 return ZaberTable(link, device.microsteps_per_deg, device.reach_s, device.device, device.axis)
             return ElliptecTable(link, device.address, device.reach_s)
 
-        table = _opened(link, driver)
+        table = self._opened("turntable.port", baud, "turntable", "turntable", driver)
         follow = device.port != EMULATED and self._follow and self.emulation is not None
         told = turn_twin(self.emulation.bench) if follow and self.emulation is not None else _nobody
         return PlacedTable(table, float(np.deg2rad(device.zero_deg)), device.direction, told)
@@ -121,15 +159,6 @@ class Connector:
 
 def _nobody(angle_deg: float) -> None:
     """No simulated camera looks."""
-
-
-def _opened(link: Link, driver: Callable[[], T]) -> T:
-    """A driver on its link; the link is closed if the driver refuses the device."""
-    try:
-        return driver()
-    except BaseException:
-        link.close()
-        raise
 
 
 def wiring_of(laser: LaserDevice) -> LaserWiring:
@@ -185,8 +214,6 @@ def assembled(
     emulation = None if twin is None else Emulation(twin, clock)
     if emulation is None and (file.simulated_cameras or EMULATED in file.ports().values()):
         raise InputError("emulated devices and simulated cameras need a twin")
-    if logs is not None:
-        logs.mkdir(parents=True, exist_ok=True)
     with ExitStack() as opened:
         cameras: list[Camera] = []
         if emulation is not None and file.simulated_cameras:

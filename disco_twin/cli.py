@@ -10,12 +10,11 @@ import typer
 from rich.console import Console
 
 from disco_twin.cli_rig import ArmOption, LogsOption, rig_app
-from hw.errors import DiscoError, naming, refused_by_the_disk
+from hw.errors import DiscoError, InputError, naming, refused_by_the_disk
 from pipeline.capture.loop import Interrupted
 
 app = typer.Typer(
     help="A digital twin of the DISCO rig: simulate a laser capture, reconstruct R_d, relight, score.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
@@ -78,6 +77,9 @@ def capture(
     from disco_twin.rig_capture import capture_with_devices
     from disco_twin.run import capture_stages, open_run
 
+    if rig is None and (arm or logs is not None):
+        option = "--arm" if arm else "--logs"
+        raise InputError("is for devices", key=option, remedy=f"name their rig file with --rig, or leave {option} out")
     with naming(scene):
         opened = open_run(scene, out, profile, None, console, faults)
         with run_log(opened.folder.root / "run.log", console):
@@ -193,21 +195,34 @@ def doctor() -> None:
 
 def main(arguments: list[str] | None = None) -> Any:
     """Entry point of `disco-twin`."""
+    words = sys.argv[1:] if arguments is None else arguments
     try:
-        return app(arguments)
+        status = app(words or ["--help"], prog_name="disco-twin", standalone_mode=False)
     except Interrupted as error:
         return _stop(str(error), 130)
+    except typer.Abort:
+        return _stop("stopped", 130)
     except DiscoError as error:
         return _stop(str(error), 2)
     except OSError as error:
         known = refused_by_the_disk(error, Path.cwd())
-        return _stop(str(known or f"{error.filename or 'input or output'}: {error.strerror or error}"), 2)
+        reason = f"{error.filename or 'input or output'}: {error.strerror or error}"
+        return _stop(str(known or f"{reason}. Remedy: correct the path, repeat the same command"), 2)
     except MemoryError:
         return _stop("not enough memory. Remedy: fewer pixels, spots or scan.vertices, or a machine with more", 2)
+    except Exception as error:
+        if not hasattr(error, "format_message"):  # of wrong options and arguments; where its class lies, typer changes
+            raise
+        context = getattr(error, "ctx", None)
+        command = "disco-twin" if context is None else context.command_path
+        problem = str(error.format_message()).rstrip(".?")
+        return _stop(f"{problem}. Remedy: `{command} --help` says what is allowed", 2)
+    sys.exit(status if isinstance(status, int) else 0)
 
 
 def _stop(message: str, status: int) -> None:
-    Console(stderr=True).print(f"disco-twin: {message}", style="red", highlight=False, markup=False, soft_wrap=True)
+    line = " ".join(message.splitlines())
+    Console(stderr=True).print(f"disco-twin: {line}", style="red", highlight=False, markup=False, soft_wrap=True)
     sys.exit(status)
 
 

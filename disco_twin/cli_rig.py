@@ -10,13 +10,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from hw.errors import InputError
+
 if TYPE_CHECKING:
     from disco_twin.rig_commands import Finding
     from disco_twin.rig_file import DevicesFile
     from pipeline.rig import RigConfig
 
-rig_app = typer.Typer(help="Devices: find them, test them, emulate them.", no_args_is_help=True)
+rig_app = typer.Typer(help="Devices: find them, test them, emulate them.")
 console = Console()
+
+LONGEST_S = 1e7  # that devices are emulated: 116 days
 
 RigPath = Annotated[Path, typer.Argument(metavar="RIG.TOML", help="The rig file.")]
 SceneOption = Annotated[
@@ -48,12 +52,15 @@ def selftest(rig: RigPath, scene: SceneOption = None, arm: ArmOption = False, lo
 def emulate(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="The scene whose devices are emulated.")],
     folder: Annotated[Path, typer.Option("--ports", metavar="DIR", help="Where the ports and rig.toml appear.")],
-    seconds: Annotated[float, typer.Option(help="How long.", min=0.1)] = 3600.0,
+    seconds: Annotated[float, typer.Option(help="How long.")] = 3600.0,
 ) -> None:
     """Serve the devices of a scene on pseudo-terminals, in real time, and write the rig file that reaches them."""
     from disco_twin.rig_commands import served
     from disco_twin.scene import load_scene
 
+    if not 0.1 <= seconds <= LONGEST_S:
+        allowed = f"0.1 to {LONGEST_S:.0f}"
+        raise InputError("is no such time", key="--seconds", value=seconds, allowed=allowed, remedy="choose another")
     loaded = load_scene(scene)
     with served(loaded.rig, loaded.seed, folder) as path:
         console.print(f"devices are served; rig file: {path}   (Ctrl-C ends it)", highlight=False, soft_wrap=True)

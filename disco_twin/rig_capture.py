@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from disco_twin.assembly import assembled
-from disco_twin.folder import content_key, write_atomically
+from disco_twin.folder import content_key, require_folder, write_atomically
 from disco_twin.rig_file import EMULATED, DevicesFile
 from disco_twin.rig_rules import load_rig_file, require_same, require_scene
 from hw.errors import InputError
@@ -56,6 +56,8 @@ def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool
     from disco_twin import simulate
 
     file, world, folder = open_rig_file(run, path, armed), run.world, run.folder
+    if logs is not None:
+        require_folder(logs, "--logs")
     if not _has_images(folder.capture):  # what the images are begun with is kept
         write_atomically(folder.devices_record, path.read_bytes())
     real = None if file.sensor is None or file.simulated_cameras else file.sensor.sensor()

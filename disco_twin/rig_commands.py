@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_twin.assembly import Connector, free_line, open_camera, require_black
-from disco_twin.folder import write_atomically
+from disco_twin.folder import require_folder, write_atomically
 from disco_twin.rig_file import EMULATED, DevicesFile, GenicamDevice, LaserDevice
 from hw.clock import WallClock
 from hw.devices.mm_ard import ADC_TOP
@@ -96,7 +96,7 @@ def _shut_after(board: Board) -> Iterator[None]:
 def _connector(file: DevicesFile, logs: Path | None) -> Connector:
     """For real devices: what is emulated is left out by the callers."""
     if logs is not None:
-        logs.mkdir(parents=True, exist_ok=True)
+        require_folder(logs, "--logs")
     return Connector(file, WallClock(), None, logs)
 
 
@@ -259,12 +259,21 @@ def _test_laser(connect: Connector, board: Board, index: int) -> str:
         own = head.require_power(file.power_tolerance)
         _require_dark(trusted, wiring, head.name, "emits behind its shut gate", "see that its gate shuts")
         trusted.open_gate(wiring.gate_line)
-        seen = _through_gate(trusted, wiring, head.name)
-        meter = "" if file.power_meter is None else f", power meter {1e3 * _metered(connect):.2f} mW"
+        seen = _through_gate(trusted, wiring, head.name, own)
+        counts = round(1e-3 * seen / wiring.watts_per_count)
+        meter = "" if file.power_meter is None else _meter_says(_metered(connect), counts)
         head.stop_emission()
         head.require_off()
         _require_dark(trusted, wiring, head.name, "is off", "check the wiring of gate and interlock")
-        return f"set {wiring.power_mw:g} mW, own reading {own:.2f} mW, photodiode {seen:.2f} mW{meter}; off again"
+        return (
+            f"set {wiring.power_mw:g} mW, own reading {own:.2f} mW, photodiode {seen:.2f} mW ({counts} counts)"
+            f"{meter}; off again"
+        )
+
+
+def _meter_says(watts: float, counts: int) -> str:
+    """The power meter's reading, and the watts_per_count that it asks for."""
+    return f", power meter {1e3 * watts:.2f} mW: watts_per_count = {watts / max(counts, 1):.4g}"
 
 
 def _cut(board: Board, head: OmicronLaser) -> Callable[[], None]:
@@ -288,8 +297,8 @@ def _require_dark(board: TrustedBoard, wiring: LaserDevice, name: str, state: st
         raise DeviceFault(f"pin {wiring.photodiode_pin}", name, problem, remedy)
 
 
-def _through_gate(board: TrustedBoard, wiring: LaserDevice, name: str) -> float:
-    """Power at the photodiode behind the open gate, in mW."""
+def _through_gate(board: TrustedBoard, wiring: LaserDevice, name: str, own_mw: float) -> float:
+    """Power at the photodiode behind the open gate, in mW; own_mw: by the laser's own reading."""
     counts, pin = board.counts(wiring.photodiode_pin), f"pin {wiring.photodiode_pin}"
     board.require_lines()
     if counts >= ADC_TOP:
@@ -298,8 +307,15 @@ def _through_gate(board: TrustedBoard, wiring: LaserDevice, name: str) -> float:
     seen = 1e3 * counts * wiring.watts_per_count
     low, high = (share * wiring.power_mw for share in wiring.photodiode_limits)
     if not low <= seen <= high:
-        problem = f"gives {seen:.2f} mW at the photodiode through its open gate (allowed: {low:g} to {high:g})"
-        raise DeviceFault(pin, name, problem, "check gate_line, photodiode_pin and the amplifier's gain")
+        problem = (
+            f"gives {seen:.2f} mW ({counts} counts) at the photodiode through its open gate "
+            f"(allowed: {low:g} to {high:g} mW)"
+        )
+        remedy = "check gate_line, photodiode_pin and the amplifier's gain"
+        if counts > DARK_COUNTS:
+            fitting = 1e-3 * own_mw / counts
+            remedy += f"; if they are right, watts_per_count is near {fitting:.3g} by the laser's own reading"
+        raise DeviceFault(pin, name, problem, remedy)
     return seen
 
 
@@ -344,11 +360,17 @@ def served(scene: RigConfig, seed: int, folder: Path) -> Iterator[Path]:
     """Emulated devices on pseudo-terminals in a folder, and the rig file that reaches them."""
     from disco_twin.firmware.serve import Server
 
-    folder.mkdir(parents=True, exist_ok=True)
-    with Server(emulated_devices(scene, seed).lines, folder) as server:
-        path = folder / "rig.toml"
-        ports = {name: str(Path(url).absolute()) for name, url in server.urls.items()}
-        write_atomically(path, rig_file_of(scene, ports).encode())
+    require_folder(folder, "--ports")
+    lines, path = emulated_devices(scene, seed).lines, folder / "rig.toml"
+    remedy = "choose another --ports, or take it away"
+    for port in (folder / name for name in lines):
+        if port.exists() and not port.is_symlink():
+            raise InputError("is in the place of an emulated device's port", file=port, remedy=remedy)
+    content = rig_file_of(scene, {name: str((folder / name).absolute()) for name in lines}).encode()
+    if path.exists() and path.read_bytes() != content:
+        raise InputError("is another rig file than the one to be written", file=path, remedy=remedy)
+    with Server(lines, folder):
+        write_atomically(path, content)
         yield path
 
 

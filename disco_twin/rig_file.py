@@ -8,21 +8,46 @@ mixture works.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
 from hw.bracket import Bracket
 from hw.record import Sensor
-from pipeline.config import Strict
+from pipeline.config import Strict, load_toml
 
 EMULATED = "emulated"
+RIG_FILE = "a rig file (docs/lab.md, section 3, shows one; `disco-twin rig emulate` writes one)"
 PROJECTOR_STEPS = 4096  # of the board's 12-bit converters
 
 Positive = Annotated[float, Field(gt=0)]
+Response = Annotated[float, Field(ge=1, le=1e24)]
 Line = Annotated[int, Field(ge=0, le=5)]
 Step = Annotated[int, Field(ge=0, lt=PROJECTOR_STEPS)]
-Port = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]  # no control characters
+PRINTABLE = r"^[^\x00-\x1f\x7f]*$"  # no control characters
+Port = Annotated[
+    str,
+    Field(
+        min_length=1,
+        max_length=200,
+        pattern=PRINTABLE,
+        description="a path as in /dev/serial/by-id/..., or `emulated`; at most 200 characters, no control characters",
+    ),
+]
+Address = Annotated[
+    str,
+    Field(
+        min_length=1,
+        max_length=200,
+        pattern=PRINTABLE,
+        description="an IP address as in 192.168.1.20, or the serial number of a USB3 camera",
+    ),
+]
+Name = Annotated[
+    str,
+    Field(min_length=1, max_length=64, pattern=PRINTABLE, description="1 to 64 characters, no control characters"),
+]
 
 
 class LaserDevice(Strict):
@@ -79,17 +104,19 @@ class GenicamDevice(Strict):
     """A GenICam camera; `name` is the scene's. address: IP (GigE Vision) or serial number (USB3 Vision)."""
 
     kind: Literal["genicam"]
-    name: str
-    address: Port
-    serial: str | None = None  # refuse another camera at this address
-    pixel_format: Annotated[str, Field(pattern=r"^Mono(10|12|14|16)[A-Za-z0-9]*$")] = "Mono12"
+    name: Name
+    address: Address
+    serial: Name | None = None  # refuse another camera at this address
+    pixel_format: Annotated[
+        str, Field(pattern=r"^Mono(10|12|14|16)[A-Za-z0-9]*$", description="Mono10, Mono12, Mono14, Mono16, or packed")
+    ] = "Mono12"
 
 
 class SimulatedCamera(Strict):
     """The scene's camera of this name, simulated: needs the renderer."""
 
     kind: Literal["simulated"]
-    name: str
+    name: Name
 
 
 class SensorDevice(Strict):
@@ -99,12 +126,14 @@ class SensorDevice(Strict):
     exponents: Annotated[tuple[Annotated[int, Field(ge=0, le=23)], ...], Field(min_length=1)] = tuple(range(12))
     bits: Annotated[int, Field(ge=8, le=16)] = 12
     saturation_dn: Annotated[int, Field(ge=1, le=65535)]  # linear below this
-    black_dn: Annotated[float, Field(ge=0)]
-    black_tolerance_dn: Positive = 2.0
-    gain_e_per_dn: Positive
-    read_noise_e: Annotated[float, Field(ge=0)]
-    dark_e_per_s: Annotated[float, Field(ge=0)] = 0.0
-    responsivity: tuple[Positive, ...]  # electrons/s per pixel for 1 W/(mm^2 sr), one a laser
+    black_dn: Annotated[float, Field(ge=0, le=65535)]
+    black_tolerance_dn: Annotated[float, Field(gt=0, le=65535)] = 2.0
+    gain_e_per_dn: Annotated[float, Field(ge=1e-6, le=1e6)]
+    read_noise_e: Annotated[float, Field(ge=0, le=1e6)]
+    dark_e_per_s: Annotated[float, Field(ge=0, le=1e9)] = 0.0
+    responsivity: tuple[
+        Annotated[float, Field(ge=1, le=1e24)], ...
+    ]  # electrons/s per pixel for 1 W/(mm^2 sr), one a laser
 
     def bracket(self) -> Bracket:
         """The exposures."""
@@ -145,6 +174,20 @@ class DevicesFile(Strict):
     power_meter: MeterDevice | None = None
     warm_up_s: Annotated[float, Field(ge=0, le=3600)] = 60.0  # from emission to the first image
     power_tolerance: Annotated[float, Field(gt=0, le=0.5)] = 0.1  # laser's own reading against power_mw
+
+    _path: Path | None = PrivateAttr(None)
+
+    @property
+    def path(self) -> Path | None:
+        """The file itself, for messages."""
+        return self._path
+
+    @classmethod
+    def load(cls, path: Path) -> DevicesFile:
+        """Read a file; what its keys say of each other is `disco_twin.rig_rules`' business."""
+        rig = load_toml(path, cls, RIG_FILE)
+        rig._path = path
+        return rig
 
     def ports(self) -> dict[str, str]:
         """Key in the file -> serial port."""

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import re
+import stat
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from disco_twin.rig_file import EMULATED, PROJECTOR_STEPS, DevicesFile, GenicamDevice, SensorDevice
+from disco_twin.rig_file import EMULATED, PROJECTOR_STEPS, DevicesFile, GenicamDevice, LaserDevice, SensorDevice
 from hw.devices.mm_ard import ADC_TOP, LINES, PINS
 from hw.errors import InputError, naming
-from pipeline.config import load_toml
+from hw.rig import DARK_COUNTS
 from pipeline.rig import RigConfig
 
 WAVELENGTH_TOLERANCE_NM = 10.0
+SOCKET = re.compile(r"socket://[^/:?]+:\d{1,5}")  # a serial port that another machine serves
 # What may change in the middle of a capture, since no image depends on it: where a device is plugged in, how long it is
 # waited for, what is refused.
 MAY_CHANGE = re.compile(
@@ -23,7 +25,7 @@ MAY_CHANGE = re.compile(
 
 def load_rig_file(path: Path) -> DevicesFile:
     """Read and check a rig file."""
-    rig = load_toml(path, DevicesFile)
+    rig = DevicesFile.load(path)
     with naming(path):
         _require_wiring(rig)
         _require_ranges(rig)
@@ -39,7 +41,7 @@ def _require_distinct(what: str, used: Mapping[str, object], choice: str, remedy
     first: dict[object, str] = {}
     for key, value in used.items():
         try:
-            thing = Path(value).resolve() if isinstance(value, str) and value.startswith("/") else value
+            thing = _device(value) if key.endswith(".port") else value
         except (ValueError, RuntimeError, OSError) as error:  # links that lead back to themselves
             raise InputError(f"leads nowhere ({error})", key=key, value=value, remedy=remedy) from error
         if thing in first:
@@ -47,6 +49,17 @@ def _require_distinct(what: str, used: Mapping[str, object], choice: str, remedy
                 f"is {what} of {first[thing]} as well", key=key, value=value, allowed=choice, remedy=remedy
             )
         first[thing] = key
+
+
+def _device(port: object) -> object:
+    """What a port's name leads to, by whatever path or link."""
+    if SOCKET.fullmatch(str(port)):
+        return port
+    path = Path(str(port)).resolve()
+    if not path.exists():
+        return path
+    found = path.stat()
+    return ("device", found.st_rdev) if stat.S_ISCHR(found.st_mode) else (found.st_dev, found.st_ino)
 
 
 def _require_wiring(rig: DevicesFile) -> None:
@@ -61,6 +74,10 @@ def _require_wiring(rig: DevicesFile) -> None:
     remedy = "give every laser an analogue pin of its own: its gain is set for one power"
     _require_distinct("the analogue pin", pins, f"another of 0 to {PINS - 1}; free: {free}", remedy)
     ports = {key: port for key, port in rig.ports().items() if port != EMULATED}
+    for key, port in ports.items():
+        if "://" in port and not SOCKET.fullmatch(port):
+            allowed, remedy = "a path, or socket://HOST:PORT", "name the device's path as in /dev/serial/by-id/..."
+            raise InputError("is no port", key=key, value=port, allowed=allowed, remedy=remedy)
     remedy = "`ls -l /dev/serial/by-id` says which device is where; `disco-twin rig probe` asks them"
     _require_distinct("the port", ports, "one device a port", remedy)
 
@@ -84,11 +101,24 @@ def _require_ranges(rig: DevicesFile) -> None:
             key, remedy = f"lasers[{i}].photodiode_limits", "they are shares of power_mw, as in [0.5, 1.5]"
             raise InputError("do not enclose 1", key=key, value=laser.photodiode_limits, allowed="lower < 1 < upper",
                              remedy=remedy)  # fmt: skip
-        least = 1e-3 * laser.power_mw / ADC_TOP
-        if laser.watts_per_count < least:
-            remedy = "measure it with a power meter, or lower the photodiode's gain: full power is near 800 counts"
-            raise InputError("the photodiode's converter ends below power_mw", key=f"lasers[{i}].watts_per_count",
-                             value=laser.watts_per_count, allowed=f"at least {least:.4g}", remedy=remedy)  # fmt: skip
+        _require_counts(i, laser)
+
+
+def _require_counts(index: int, laser: LaserDevice) -> None:
+    """The photodiode's converter goes up to the power, and tells the least that is accepted from darkness."""
+    power_w = 1e-3 * laser.power_mw
+    least, most = power_w / ADC_TOP, power_w * laser.photodiode_limits[0] / DARK_COUNTS
+    if least <= laser.watts_per_count < most:
+        return
+    if laser.watts_per_count < least:
+        problem = "the photodiode's converter ends below power_mw"
+        remedy = "measure it with a power meter, or lower the photodiode's gain: full power is near 800 counts"
+    else:
+        low = power_w * laser.photodiode_limits[0] / laser.watts_per_count
+        problem = f"the lower of photodiode_limits is {low:.2g} counts, and up to {DARK_COUNTS} are darkness"
+        remedy = "give it in watts (not mW) per count; full power is near 800 counts"
+    raise InputError(problem, key=f"lasers[{index}].watts_per_count", value=laser.watts_per_count,
+                     allowed=f"at least {least:.4g}, below {most:.4g}", remedy=remedy)  # fmt: skip
 
 
 def _require_cameras(rig: DevicesFile) -> None:

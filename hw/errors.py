@@ -5,7 +5,11 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import date, time
 from pathlib import Path
+from typing import Self
+
+MOST_SHOWN = 160  # characters of a value
 
 
 class DiscoError(Exception):
@@ -46,12 +50,36 @@ class Refused(DiscoError):
 
 
 class DeviceError(DiscoError):
-    """Something is wrong with a device: names its port, the device as the rig knows it, the problem and the remedy."""
+    """Something is wrong with a device: names its port, the device as the rig knows it, the problem and the remedy.
 
-    def __init__(self, port: str, device: str, problem: str, remedy: str) -> None:
+    key, file: where the port is set, as far as known
+    """
+
+    def __init__(
+        self,
+        port: str,
+        device: str,
+        problem: str,
+        remedy: str,
+        *,
+        key: str | None = None,
+        file: str | Path | None = None,
+    ) -> None:
         self.port, self.device, self.problem, self.remedy = port, device, problem, remedy
-        self.without_remedy = f"{port}: {device} {problem}"
+        self.key, self.file = key, file
+        where = port if key is None else f"{'' if file is None else f'{file}: '}{key} = {_shown(port)}"
+        self.without_remedy = f"{where}: {device} {problem}"
         super().__init__(f"{self.without_remedy}. Remedy: {remedy}")
+
+    def set_by(self, key: str, port: str) -> Self:
+        """The same error; `key` of the rig file says which port the device hangs on."""
+        return type(self)(port, self.device, self.problem, self.remedy, key=key, file=self.file)
+
+    def within(self, file: str | Path) -> Self:
+        """The same error, its key being one of `file`, unless it names a file already or no key."""
+        if self.file is not None or self.key is None:
+            return self
+        return type(self)(self.port, self.device, self.problem, self.remedy, key=self.key, file=file)
 
 
 class NoAnswer(DeviceError):
@@ -87,7 +115,7 @@ def naming(file: str | Path) -> Iterator[None]:
     """Errors about a key that leave this block name the file that the key stands in."""
     try:
         yield
-    except InputError as error:
+    except (InputError, DeviceError) as error:
         raise error.within(file) from error.__cause__
 
 
@@ -109,5 +137,14 @@ def _shown(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_shown, value))}]"
-    return repr(value)
+        return _cut(f"[{', '.join(map(_shown, value[:MOST_SHOWN]))}]")
+    if isinstance(value, date | time):
+        return value.isoformat()
+    if isinstance(value, int) and value.bit_length() > MOST_SHOWN:
+        return _cut(hex(value))  # Python refuses to write thousands of digits
+    return _cut(repr(value))
+
+
+def _cut(text: str) -> str:
+    """Its beginning: a message is to be read."""
+    return text if len(text) <= MOST_SHOWN else f"{text[: MOST_SHOWN - 3]}..."

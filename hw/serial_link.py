@@ -6,7 +6,9 @@ waits for messages. What a message means is the drivers' business (`hw.devices`)
 
 from __future__ import annotations
 
+import errno
 import logging
+import re
 from collections import deque
 from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
@@ -16,7 +18,7 @@ import serial
 from hw.bytelog import ByteLog
 from hw.clock import Clock
 from hw.errors import Garbled, NoAnswer, SwitchedOff, Unplugged
-from hw.guard import GuardClosed
+from hw.guard import FAILURES, GuardClosed
 from hw.ports.protocol_guard import Serial as GuardedPort
 
 log = logging.getLogger(__name__)
@@ -27,6 +29,32 @@ SLICE_S = 0.02  # a port is never waited for longer at a time: the precision of 
 WRITE_TIMEOUT_S = 1.0
 HEARD_BYTES = 40
 REMEDY = "check cable and power, and the port's name in the rig file (`disco-twin rig probe` lists what answers)"
+
+LISTED = "`ls -l /dev/serial/by-id` lists what is there"
+# Why a port cannot be opened, and the remedy, by error number.
+NOT_THERE = ("there is no such device", f"plug it in, switch it on and correct the port: {LISTED}")
+FORBIDDEN = (
+    "permission denied",
+    "join the group that owns the port (`sudo usermod -aG dialout $USER` in most cases, then log in again)",
+)
+IN_USE = ("another program uses it", "end that program (`fuser -v` and the port names it)")
+NO_PORT = ("it is no serial port", f"name the device's port: {LISTED}")
+NOBODY = ("nobody answers there", "start the program that serves the port, or correct the port")
+TROUBLE = {
+    errno.ENOENT: NOT_THERE,
+    errno.ENXIO: NOT_THERE,
+    errno.ENODEV: NOT_THERE,
+    errno.ELOOP: NOT_THERE,
+    errno.EACCES: FORBIDDEN,
+    errno.EPERM: FORBIDDEN,
+    errno.EBUSY: IN_USE,
+    errno.EAGAIN: IN_USE,
+    errno.ENOTTY: NO_PORT,
+    errno.EISDIR: NO_PORT,
+    errno.ENOTDIR: NO_PORT,
+    errno.ECONNREFUSED: NOBODY,
+}
+NUMBER = re.compile(r"\[Errno (\d+)\]|\((\d+), '")  # pyserial and guards give it as text alone
 
 GUARD_REMEDY = "see that the laser is off, then repeat the same command"
 
@@ -75,16 +103,17 @@ class Link:
             self._port = serial.serial_for_url(
                 url, baudrate=baud, timeout=SLICE_S, write_timeout=WRITE_TIMEOUT_S, exclusive=True
             )
-        except (OSError, ValueError) as error:
-            raise self._lost("cannot be opened", error) from error
+        except (*FAILURES, ValueError) as error:
+            problem, remedy = _trouble(error)
+            raise self._lost(f"cannot be opened: {problem}", error, remedy) from error
         self._note("open", b"")
 
     def write(self, data: bytes) -> None:
         """Send all bytes."""
         try:
             self._port.write(data)
-        except OSError as error:
-            raise self._lost("does not take bytes any more", error) from error
+        except FAILURES as error:
+            raise self._lost(f"does not take bytes any more ({error})", error) from error
         self._heard = b""
         self._note(">", data)
 
@@ -100,8 +129,8 @@ class Link:
         try:
             there = self._port.in_waiting
             data = bytes(self._port.read(max(1, there))) if there or wait else b""
-        except OSError as error:
-            raise self._lost("cannot be read any more", error) from error
+        except FAILURES as error:
+            raise self._lost(f"cannot be read any more ({error})", error) from error
         if data:
             self._heard = (self._heard + data)[:HEARD_BYTES]
             self._note("<", data)
@@ -134,9 +163,16 @@ class Link:
         if self._log is not None:
             self._log.note(self.clock.now(), mark, data)
 
-    def _lost(self, what: str, error: Exception) -> Unplugged:
+    def _lost(self, what: str, error: Exception, remedy: str = REMEDY) -> Unplugged:
         kind = SwitchedOff if isinstance(error, GuardClosed) else Unplugged
-        return kind(self.url, f"the port of {self.device}", f"{what} ({error})", REMEDY)
+        return kind(self.url, f"the port of {self.device}", what, remedy)
+
+
+def _trouble(error: Exception) -> tuple[str, str]:
+    """Why a port cannot be opened, and the remedy."""
+    found = NUMBER.search(str(error))
+    number = int(found[1] or found[2]) if found else 0
+    return TROUBLE.get(number, (str(error), REMEDY))
 
 
 class Inbox(Generic[M]):

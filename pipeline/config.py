@@ -5,9 +5,9 @@ from __future__ import annotations
 import difflib
 import json
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import (
     AfterValidator,
@@ -22,6 +22,7 @@ from pydantic import (
 )
 
 from hw.errors import InputError
+from pipeline.config_errors import one_line
 
 
 class Strict(BaseModel):
@@ -35,10 +36,14 @@ class Strict(BaseModel):
         """TOML's arrays are lists, ours are tuples."""
         if not isinstance(data, dict):
             return data
-        version = data.get("format_version", 1)
-        if type(version) is not int:  # Python's True and 1.0 equal 1
-            data = data | {"format_version": str(version)}
-        return {key: _tuples(value) for key, value in data.items()}
+        return {key: str(v) if cls._no_choice(key, v) else _tuples(v) for key, v in data.items()}
+
+    @classmethod
+    def _no_choice(cls, key: str, value: Any) -> bool:
+        """Whether `true` or `1.0` stands where a whole number is one of a few: to Python both equal 1."""
+        field = cls.model_fields.get(key)
+        choices = get_args(field.annotation) if field and get_origin(field.annotation) is Literal else ()
+        return isinstance(value, bool | float) and value in choices and type(value) not in map(type, choices)
 
 
 def _tuples(value: Any) -> Any:
@@ -69,26 +74,55 @@ NearbyFile = Annotated[Path, Field(strict=False), AfterValidator(_resolve)]
 """A file that must exist; relative names are relative to the folder of the TOML file that names it."""
 
 
-def load_toml(path: str | Path, schema: type[M]) -> M:
-    """Read and validate a TOML file. Every failure is one `InputError` that names the first problem."""
+def load_toml(path: str | Path, schema: type[M], what: str = "a scene's TOML file") -> M:
+    """Read and validate a TOML file. Every failure is one `InputError` that names the first problem.
+
+    what: the kind of file, in words for the remedy where another one was given
+    """
     path = Path(path)
+    remedy = f"give the path of {what}"
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        if path.is_char_device():  # reading it may wait for ever
+            raise InputError("is a device, not a file", file=path, remedy=remedy)
+        data = tomllib.loads(path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
     except FileNotFoundError:
         near = difflib.get_close_matches(path.name, (p.name for p in path.parent.glob("*.toml")), 1)
-        remedy = f"did you mean {path.parent / near[0]}?" if near else "give the path of a scene's TOML file"
+        remedy = f"did you mean {path.parent / near[0]}?" if near else remedy
         raise InputError("no such file", file=path, remedy=remedy) from None
+    except IsADirectoryError as error:
+        raise InputError("is a folder, not a file", file=path, remedy=remedy) from error
+    except PermissionError as error:
+        remedy = f"allow yourself to read it, or {remedy}"
+        raise InputError("cannot be read: permission denied", file=path, remedy=remedy) from error
     except OSError as error:
-        remedy = "give the path of a scene's TOML file"
         raise InputError(f"cannot be read: {error.strerror}", file=path, remedy=remedy) from error
     except UnicodeDecodeError as error:
-        raise InputError(f"is not UTF-8 text (byte {error.start})", file=path, remedy="save it as UTF-8") from error
-    except tomllib.TOMLDecodeError as error:
-        remedy = "mend that line; texts stand in quotes, a table's name in brackets"
-        raise InputError(f"is not valid TOML: {error}", file=path, remedy=remedy) from error
+        remedy = f"save it as UTF-8, or {remedy}"
+        raise InputError(f"is not UTF-8 text (byte {error.start})", file=path, remedy=remedy) from error
     except RecursionError as error:
         raise InputError("is nested too deeply", file=path, remedy="mend the brackets") from error
+    except ValueError as error:  # tomllib's own, and a number of thousands of digits
+        remedy = "mend that line; texts stand in quotes, a table's name in brackets, a key once"
+        raise InputError(f"is not valid TOML: {error}", file=path, remedy=remedy) from error
+    if not data:
+        raise InputError("is empty: it has no key", file=path, remedy=f"write it, or {remedy}")
+    for key, number in _numbers(data):
+        if not -(2**63) <= number < 2**63:
+            remedy = "write fewer digits"
+            raise InputError("is no TOML", file=path, key=key, value=number, allowed="64 bits", remedy=remedy)
     return check(data, schema, path)
+
+
+def _numbers(data: Any, key: str = "") -> Iterator[tuple[str, int]]:
+    """Every whole number with its key."""
+    if isinstance(data, dict):
+        for name, value in data.items():
+            yield from _numbers(value, f"{key}.{name}" if key else name)
+    elif isinstance(data, list):
+        for place, value in enumerate(data):
+            yield from _numbers(value, f"{key}[{place}]")
+    elif isinstance(data, int):
+        yield key, data
 
 
 def read_json(path: Path, schema: type[T], remedy: str) -> T:
@@ -119,99 +153,4 @@ def check(data: dict[str, Any], schema: type[M], path: str | Path) -> M:
     try:
         return schema.model_validate(data, context={"folder": Path(path).resolve().parent})
     except ValidationError as error:
-        raise _one_line(error, data, schema, path) from None
-
-
-def _one_line(error: ValidationError, data: dict[str, Any], schema: type[Strict], path: str | Path) -> InputError:
-    """The first problem of a pydantic error. Unknown keys go before missing ones, as a typo causes both."""
-    problem = min(error.errors(include_url=False), key=lambda p: _rank(p["type"]))
-    kind, location, context = problem["type"], problem["loc"], problem.get("ctx", {})
-    key = _dotted(location, data, keep_last=kind == "missing")
-    if kind == "extra_forbidden":
-        *parent, name = location
-        node = _node(schema.model_json_schema(), parent)
-        remedy = _nearest(str(name), node.get("properties", {}))
-        return InputError("unknown key", file=path, key=_dotted(location, data), remedy=remedy)
-    if kind == "missing":
-        if location and isinstance(location[-1], int):
-            key, _, _ = key.rpartition("[")
-            return InputError(f"has {location[-1]} values", file=path, key=key, remedy="give one more")
-        return InputError("required key is missing", file=path, key=key, remedy="add it")
-    if kind == "union_tag_not_found":
-        node = _node(schema.model_json_schema(), location)
-        tags = ", ".join(node.get("discriminator", {}).get("mapping", {}))
-        remedy = "add it"
-        return InputError("required key is missing", file=path, key=f"{key}.kind", allowed=tags or None, remedy=remedy)
-    if kind == "union_tag_invalid":
-        tag, tags = context["tag"], context["expected_tags"].replace("'", "")
-        remedy = _nearest(tag, tags.split(", "))
-        return InputError("unknown kind", file=path, key=f"{key}.kind", value=tag, allowed=tags, remedy=remedy)
-    value = problem["input"] if isinstance(problem["input"], str | int | float | bool | list | tuple) else None
-    allowed = _allowed(_node(schema.model_json_schema(), location))
-    message = problem["msg"].removeprefix("Value error, ").replace("a valid tuple", "an array")
-    if message.startswith("Input should"):
-        message = "i" + message[1:]
-    return InputError(message, file=path, key=key or None, value=value, allowed=allowed)
-
-
-def _rank(kind: str) -> int:
-    """Of a union's members all report; a value out of range says more than `is not of the other member's type`."""
-    return 0 if kind == "extra_forbidden" else 2 if kind.endswith("_type") else 1
-
-
-def _dotted(location: tuple[int | str, ...], data: Any, keep_last: bool = True) -> str:
-    """`rig.cameras[1].name` from a pydantic location, without the parts that are tags of unions."""
-    out = ""
-    for i, part in enumerate(location):
-        if isinstance(part, int):
-            out += f"[{part}]"
-            data = data[part] if isinstance(data, list | tuple) and part < len(data) else None
-        elif isinstance(data, dict) and (part in data or (keep_last and i == len(location) - 1)):
-            out += f".{part}" if out else part
-            data = data.get(part)
-    return out
-
-
-def _nearest(name: str, valid: Iterable[str]) -> str:
-    near = difflib.get_close_matches(name, valid, 1, cutoff=0.5)
-    return f"did you mean {near[0]!r}?" if near else f"use one of {', '.join(valid)}"
-
-
-def _node(root: dict[str, Any], location: Iterable[int | str]) -> dict[str, Any]:
-    """The part of a JSON schema that a pydantic location points to."""
-
-    def follow(node: dict[str, Any]) -> dict[str, Any]:
-        while "$ref" in node:
-            node = root["$defs"][node["$ref"].rsplit("/", 1)[1]]
-        return node
-
-    node = root
-    for part in location:
-        tagged = node.get("discriminator", {}).get("mapping", {})
-        options = [follow(option) for option in node.get("anyOf", [])] or [node]
-        if part in tagged:
-            node = follow({"$ref": tagged[part]})
-        elif isinstance(part, int):
-            arrays = [option for option in options if option.get("type") == "array"]
-            fixed = arrays[0].get("prefixItems", []) if arrays else []
-            node = follow(fixed[part] if part < len(fixed) else arrays[0].get("items", {})) if arrays else {}
-        else:
-            inside = [option["properties"][part] for option in options if part in option.get("properties", {})]
-            node = follow(inside[0]) if inside else node  # otherwise the tag of a plain union
-    return node
-
-
-def _allowed(node: dict[str, Any]) -> str | None:
-    """The range that a JSON schema's node states, in words."""
-    node = next((option for option in node.get("anyOf", []) if option.get("type") != "null"), node)
-    signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
-    words = [f"{sign} {node[key]:g}" for key, sign in signs.items() if key in node]
-    words += [f"at {bound} {node[key]} values" for key, bound in _LENGTHS.items() if key in node]
-    if "enum" in node:
-        words.append(", ".join(map(str, node["enum"])))
-    if "pattern" in node:
-        words.append(f"pattern {node['pattern']}")
-    return " and ".join(words) or None
-
-
-_LENGTHS = {"minItems": "least", "maxItems": "most"}
+        raise one_line(error, data, schema, path) from None

@@ -108,6 +108,13 @@ def measure_response(capture: Path, rig: RigConfig, sensor: Sensor) -> Response:
         with StreamReader(capture / FOLDER / camera.name / BRACKET) as stream:
             stream.require_complete()
             images.append([_intact(raw).charge for raw in stream])
+        if len(images[-1]) != len(images[0]):
+            first = rig.cameras[0].name
+            raise InputError(
+                f"the bracket has {len(images[-1])} exposures, that of camera {first} has {len(images[0])}",
+                file=capture / FOLDER / camera.name / BRACKET,
+                remedy="take the bracket of every camera with the same exposures: they share one response",
+            )
     seconds = [sensor.longest_exposure_s * 2.0**-k for k in range(len(images[0]))]
     together = [np.concatenate([np.ravel(i) for i in same]) for same in zip(*images, strict=True)]
     return fit_response(together, seconds, sensor)

@@ -71,7 +71,9 @@ Key = tuple[int, int, int, int, int]  # camera, angle, u, v, laser; a silhouette
 
 def import_capture(folder: Path, out: Path, progress: Callable[[int, int], None] | None = None) -> Plan:
     """Write the stream and what the pipeline is told with it into `out`; the plan that the images make up."""
-    described = load_toml(folder / "capture.toml", CaptureDescription)
+    described = load_toml(
+        folder / "capture.toml", CaptureDescription, "a capture.toml (docs/lab.md, section 6, shows one)"
+    )
     table = folder / "images.csv"
     brackets = _read_table(table, described)
     plan = _plan(table, described.rig, brackets)

@@ -44,7 +44,7 @@ def one_line(caught: pytest.ExceptionInfo[InputError], *parts: str) -> None:
 def test_a_number_is_a_number(value: str, tmp_path: Path) -> None:
     path = tmp_path / "scene.toml"
     path.write_text(GOOD.replace("[[rig.cameras]]", f"[rig]\nspots = {value}\n[[rig.cameras]]", 1))
-    with pytest.raises(InputError, match=r"rig\.spots = .*integer"):
+    with pytest.raises(InputError, match=r"rig\.spots = .*is no whole number.*Remedy"):
         load_scene(path)
 
 

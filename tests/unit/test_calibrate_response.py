@@ -22,12 +22,14 @@ from disco_twin.scene import load_scene
 from disco_twin.simulate import take_targets
 from disco_twin.world import World
 from hw.errors import InputError
-from hw.record import Sensor, to_radiance
+from hw.record import RawImage, Sensor, to_radiance
 from pipeline.calibrate.calibration import nominal_calibration
 from pipeline.calibrate.measure import has_targets, measure_response
 from pipeline.calibrate.response import TABLE, Response, fit_response
+from pipeline.capture.layout import ImageMeta
 from pipeline.capture.loop import capture
-from pipeline.capture.stream import StreamReader
+from pipeline.capture.plan import Plan
+from pipeline.capture.stream import StreamReader, StreamWriter
 from pipeline.capture.targets import BRACKET, FOLDER, make_bracket
 from pipeline.run import calibrate
 
@@ -145,6 +147,22 @@ def test_a_bracket_that_says_nothing_is_refused(name: str) -> None:
     images, seconds, match = SAYS_NOTHING[name]
     with pytest.raises(InputError, match=match + ".*Remedy"):
         fit_response(images, seconds, SENSOR)
+
+
+def test_brackets_of_unequal_length_are_refused(tmp_path: Path) -> None:
+    """Two cameras of a lab's folder, the second with an exposure less."""
+    rig = faulty_rig()
+    for camera, steps in zip(rig.cameras[:2], (4, 3), strict=True):
+        plan = Plan((camera.name,), tuple(float(k) for k in range(steps)), (), len(rig.lasers))
+        with StreamWriter(tmp_path / FOLDER / camera.name / BRACKET, plan) as stream:
+            for k in range(steps):
+                meta = ImageMeta(0.0, 0.0, 0.0, -1, -1)
+                stream.append(plan.address(k), RawImage(np.zeros(SIZE, np.uint8), np.full(SIZE, 99, np.uint16)), meta)
+    with pytest.raises(InputError) as caught:
+        measure_response(tmp_path, rig.model_copy(update={"cameras": rig.cameras[:2]}), SENSOR)
+    folder = tmp_path / FOLDER / rig.cameras[1].name / BRACKET
+    said = f"{folder}: the bracket has 3 exposures, that of camera {rig.cameras[0].name} has 4. Remedy: take the"
+    assert str(caught.value).startswith(said) and "\n" not in str(caught.value)
 
 
 def test_a_curved_camera_of_the_twin_means_radiance_after_its_bracket(tmp_path: Path) -> None:

@@ -113,7 +113,7 @@ def test_files_that_are_no_scene(tmp_path: Path) -> None:
         load_scene(tmp_path / "binary.toml")
     with pytest.raises(InputError, match=r"no such file.*did you mean .*quick\.toml"):
         load_scene(tmp_path / "quik.toml")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match=r"is a folder, not a file.*Remedy: give the path of a scene's TOML file"):
         load_scene(tmp_path)
 
 
