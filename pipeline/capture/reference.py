@@ -1,7 +1,8 @@
 """Has the rig moved while the capture was interrupted? A stored spot of every laser is shot again and compared.
 
 Compared are laser power (photodiode), radiance per watt and where the light lies in the image. Anything beyond the
-tolerances is refused with its figures: images before and after would not belong to one object in one place.
+tolerances is refused with its figures: images before and after would not belong to one object in one place. Where the
+object is too dark in a laser's light for its image to tell anything, its power still is compared.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from scipy import ndimage
 
 from hw.errors import DiscoError
 from hw.interface import Rig, gate_open
-from hw.record import Sensor, to_radiance
+from hw.record import RawImage, Sensor, to_radiance
 from pipeline.capture.plan import ImageAddress
 from pipeline.capture.stream import CorruptImage, StreamReader
 
@@ -79,8 +80,9 @@ class _Reference:
 def require_unmoved(rig: Rig, stored: StreamReader, sensor: Sensor) -> list[Comparison]:
     """Shoot a stored spot of every laser again; refuse to go on if one differs, or if none is bright enough to tell.
 
-    A laser without a stored spot has nothing to be compared with. Leaves turntable, mirrors and clock at the last
-    reference, gates shut.
+    A laser whose spots are all dim among bright ones is compared by its power alone: that mirrors and object are where
+    they were is told by the others. A laser without a stored spot has nothing to be compared with. Leaves turntable,
+    mirrors and clock at the last reference, gates shut.
     """
     of_laser: list[list[int]] = [[] for _ in range(stored.plan.lasers)]
     for index in range(len(stored) - 1, -1, -1):
@@ -94,15 +96,27 @@ def require_unmoved(rig: Rig, stored: StreamReader, sensor: Sensor) -> list[Comp
             "no stored spot is bright enough to tell whether the rig has moved since the capture was interrupted. "
             "Remedy: start a new capture in another folder"
         )
-    if dim:
-        log.warning("no stored spot of laser %s is bright enough to tell whether it has changed", str(dim)[1:-1])
+    for laser in dim:
+        _require_power(rig, stored, of_laser[laser])
     return [_require_same(rig, stored, sensor, reference) for reference in found.values() if reference is not None]
 
 
-def _require_same(rig: Rig, stored: StreamReader, sensor: Sensor, then: _Reference) -> Comparison:
-    """Shoot one reference again."""
-    plan, address, meta = stored.plan, then.address, stored.meta(then.address)
-    aim = plan.spots[address.spot]
+def _require_power(rig: Rig, stored: StreamReader, indices: Sequence[int]) -> None:
+    """The power of a laser whose images tell nothing, against that of its last image. indices: the last one first."""
+    address, then = stored.plan.address(indices[0]), stored.meta(indices[0]).photodiode_w
+    _, now = _shoot(rig, stored, address)
+    what = f"laser power of {address}: {1e3 * now:.3g} mW, was {1e3 * then:.3g} mW (allowed: {100 * POWER_SHARE:g} %)"
+    if not then > 0 or not abs(now / then - 1) <= POWER_SHARE:
+        raise RigMoved(
+            f"the rig has changed since image {indices[0]}: {what}, and its images are too dim to tell more. Remedy: "
+            "see to laser, gate and fibre, or start a new capture in another folder"
+        )
+    log.warning("no stored spot of laser %d is bright enough to compare images: %s", address.laser, what)
+
+
+def _shoot(rig: Rig, stored: StreamReader, address: ImageAddress) -> tuple[RawImage, float]:
+    """Take a stored spot once more; its image, and the photodiode's watts."""
+    plan, meta, aim = stored.plan, stored.meta(address), stored.plan.spots[address.spot]
     rig.turntable.move(meta.angle_rad)
     rig.projector.move(aim.u, aim.v)
     rig.resume_at(meta.time_s)  # a simulated laser's drift is a function of time: like is compared with like
@@ -111,6 +125,13 @@ def _require_same(rig: Rig, stored: StreamReader, sensor: Sensor, then: _Referen
         power = rig.photodiode.read()
     if not power > 0:
         raise RigMoved(f"no laser light: the photodiode reads {power:g} W where it read {meta.photodiode_w:g} W")
+    return raw, power
+
+
+def _require_same(rig: Rig, stored: StreamReader, sensor: Sensor, then: _Reference) -> Comparison:
+    """Shoot one reference again."""
+    plan, address, meta = stored.plan, then.address, stored.meta(then.address)
+    raw, power = _shoot(rig, stored, address)
     again = to_radiance(raw, sensor, address.laser)
     now, noise = again.radiance / power, again.variance / power**2
     result = compare(then.radiance, np.asarray(now, float), then.variance + noise, power / meta.photodiode_w)

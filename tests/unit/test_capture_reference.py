@@ -13,6 +13,7 @@ from test_capture_twin import PLAN, RIG, Glow
 from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.firmware.emulate import Emulation
 from disco_twin.rig import TwinRig
+from hw.errors import DiscoError
 from hw.interface import Aim
 from hw.record import Sensor
 from pipeline.capture.loop import capture
@@ -162,3 +163,59 @@ def test_earlier_views_are_looked_at_where_the_last_one_is_dim(tmp_path: Path) -
     with pytest.raises(RuntimeError, match="out of light"):
         capture(Emulation(TwinRig(RIG, Dim(5, 0), seed=5)).serial_rig(), plan, tmp_path, sensor=SENSOR)
     assert len(StreamReader(tmp_path)) == 74 + 36 + 2  # three were references
+
+
+class Absorbed(Glow):
+    """An object that is black in one laser's light."""
+
+    def __init__(self, black: int, fail_at: int = -1) -> None:
+        super().__init__(fail_at)
+        self.black = black
+
+    def image(self, camera: int, aim: Aim, laser: int) -> NDArray[np.float32]:
+        return super().image(camera, aim, laser) * np.float32(1e-9 if laser == self.black else 1.0)
+
+
+def weaker(twin: TwinRig, laser: int, share: float) -> None:
+    """Behind the head, which goes on saying that it gives what it was set to."""
+    watts = twin.power.watts
+    twin.power.watts = lambda k, time_s: (share if k == laser else 1.0) * watts(k, time_s)  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize(
+    ("share", "says"),
+    [
+        (0.75, r"since image 5: laser power of view 0, spot 1, laser 1: 2\.\d+ mW, was 3\.\d+ mW \(allowed: 20 %\)"),
+        (1.3, r"since image 5: laser power of view 0, spot 1, laser 1: 5\.\d+ mW, was 3\.\d+ mW \(allowed: 20 %\)"),
+        (0.05, r"laser 532 nm gives 0\.\d+ mW at the photodiode instead of 10 mW.*Remedy"),
+        (0.9, None),
+    ],
+)
+def test_a_dim_laser_among_bright_ones_is_compared_by_its_power(
+    tmp_path: Path, share: float, says: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Rationale: its images cannot tell that its fibre or gate has failed, and the other lasers' look right."""
+    parts = tmp_path / "parts"
+    with pytest.raises(RuntimeError, match="out of light"):
+        capture(Emulation(TwinRig(RIG, Absorbed(1, fail_at=9), seed=5)).serial_rig(), PLAN, parts)
+    before = contents(parts)
+    twin = TwinRig(RIG, Absorbed(1), seed=5)
+    emulation = Emulation(twin)
+    weaker(twin, 1, share)
+    if says is None:
+        capture(emulation.serial_rig(), PLAN, parts, sensor=SENSOR)
+        assert "no stored spot of laser 1 is bright enough to compare images: laser power of view" in caplog.text
+        return
+    with pytest.raises(DiscoError, match=says):
+        capture(emulation.serial_rig(), PLAN, parts, sensor=SENSOR)
+    assert contents(parts) == before
+    assert emulation.bench.light() == [] and emulation.bench.hazards == []
+
+
+def test_resuming_with_a_dim_laser_gives_the_same_bytes(tmp_path: Path) -> None:
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    capture(TwinRig(RIG, Absorbed(1), seed=5), PLAN, whole)
+    with pytest.raises(RuntimeError, match="out of light"):
+        capture(Emulation(TwinRig(RIG, Absorbed(1, fail_at=9), seed=5)).serial_rig(), PLAN, parts)
+    capture(Emulation(TwinRig(RIG, Absorbed(1), seed=5)).serial_rig(), PLAN, parts, sensor=SENSOR)
+    assert contents(parts) == contents(whole)
