@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import resource
 import sys
@@ -10,6 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+
+log = logging.getLogger(__name__)
 
 MIB = 1024.0 * 1024.0
 
@@ -39,8 +42,8 @@ def _reset_peak() -> None:
     """Linux resets a process's high-water mark when 5 is written to clear_refs; sandboxes may forbid it."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return
+    except OSError as error:
+        log.debug("the peak of memory counts from the process's beginning: %s", error)
 
 
 def peak_memory_mb() -> float:
@@ -49,8 +52,8 @@ def peak_memory_mb() -> float:
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return float(line.split()[1]) / 1024.0
-    except OSError:
-        pass  # no /proc (macOS): ask getrusage
+    except OSError as error:
+        log.debug("%s: asking getrusage instead", error)  # no /proc (macOS)
     return _maxrss_mb(resource.getrusage(resource.RUSAGE_SELF))
 
 

@@ -68,8 +68,11 @@ def test_off_though_the_main_thread_is_busy_or_a_child_keeps_the_socket(laser: L
 @pytest.mark.parametrize("how", ["exception", "exit"])
 def test_off_at_the_end_of_the_program(laser: Laser, run: Run, how: str) -> None:
     program = run(laser, how)
+    begun = time.monotonic()
     program.communicate("\n")
     wait(laser, on=False, limit_s=3)
+    assert program.returncode == (how == "exception")
+    assert begun < laser.went_off < begun + 3 and laser.said.index("LOn") < len(laser.said) - 1
 
 
 def test_it_insists_until_the_laser_confirms(lasers: Callable[..., Laser], ports: Callable[[Laser], Serial]) -> None:
@@ -212,9 +215,12 @@ def test_every_guard_sees_the_signal(lasers: Callable[..., Laser], run: Run) -> 
     program = run(three[0], ",".join(laser.port for laser in three[1:]), THREE)
     for laser in three:
         wait(laser, on=True)
+    begun = time.monotonic()
     program.send_signal(signal.SIGTERM)
     for laser in three:
         wait(laser, on=False, limit_s=2 * LIMIT_S)
+    assert program.poll() is None  # it has not got to its handler
+    assert all(begun < laser.went_off < begun + 2 * LIMIT_S for laser in three)
 
 
 THREE = """

@@ -214,8 +214,11 @@ def test_closing_a_port_whose_guard_was_killed_switches_off(laser: Laser, ports:
     (own,) = guards_of(port=laser.port)
     os.kill(own, signal.SIGKILL)
     os.waitid(os.P_PID, own, os.WEXITED | os.WNOWAIT)
+    assert laser.on
+    laser.said.clear()
     port.close()
     wait(laser, on=False)
+    assert laser.said[0] == "LOf" and port.gone() == "it is closed"
 
 
 def test_a_link_whose_guard_has_switched_off_says_that_and_not_that_a_cable_is_out(link: Link) -> None:

@@ -38,7 +38,13 @@ def test_commands_exist(repository: Path) -> None:
     from disco_twin.cli import app
 
     root = get_command(app)
-    for words in re.findall(r"^disco-twin ((?:rig )?[a-z]+)", "\n".join(blocks(repository, "sh")), flags=re.MULTILINE):
-        command = root
-        for word in words.split():
-            command = command.commands[word]  # type: ignore[attr-defined]
+    seen = set()
+    for line in re.findall(r"^disco-twin ([^#\n]+)", "\n".join(blocks(repository, "sh")), flags=re.MULTILINE):
+        command, words = root, line.split()
+        while hasattr(command, "commands"):
+            assert words[0] in command.commands, line
+            command = command.commands[words.pop(0)]
+        known = {option for parameter in command.params for option in parameter.opts}
+        assert {word for word in words if word.startswith("--")} <= known, line
+        seen.add(command.name)
+    assert seen == {"probe", "selftest", "plan", "capture", "quality", "reconstruct"}
