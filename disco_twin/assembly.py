@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -173,27 +174,18 @@ def wiring_of(laser: LaserDevice) -> LaserWiring:
     )
 
 
-def open_camera(file: DevicesFile, device: GenicamDevice, shape: tuple[int, int]) -> GenicamCamera:
-    """A GenICam camera of the rig file that makes the bracket's exposures. shape: (height, width)."""
-    from hw.devices.genicam import CameraError, GenicamCamera
+def open_camera(device: GenicamDevice, sensor: SensorDevice, shape: tuple[int, int]) -> GenicamCamera:
+    """A GenICam camera that makes the bracket's exposures. shape: (height, width)."""
+    from hw.devices.genicam import GenicamCamera
     from hw.devices.viva import VivaGrabber
 
-    assert file.sensor is not None  # the rig file's own check
-    table = f"cameras[{file.cameras.index(device)}]"
+    grabber = VivaGrabber(device.address, device.pixel_format, shape, serial=device.serial)
+    camera = GenicamCamera(device.name, grabber, sensor.bracket(), shape)
     try:
-        grabber = VivaGrabber(device.address, device.pixel_format, shape, serial=device.serial)
-        camera = GenicamCamera(device.name, grabber, file.sensor.bracket(), shape)
-        try:
-            camera.check()
-        except BaseException:
-            camera.close()
-            raise
-    except CameraError as error:
-        raise CameraError(f"{file.path}: {table}.address = {device.address!r}: {error}") from error
-    except InputError as error:
-        key = error.key if error.key is None or "." in error.key else f"{table}.{error.key}"
-        raise InputError(error.problem, file=file.path, key=key, value=error.value, allowed=error.allowed,
-                         remedy=error.remedy) from error  # fmt: skip
+        camera.check()
+    except BaseException:
+        camera.close()
+        raise
     return camera
 
 
@@ -225,14 +217,15 @@ def assembled(
         raise InputError("emulated devices and simulated cameras need a twin")
     with ExitStack() as opened:
         cameras: list[Camera] = []
+        black: list[Callable[[], float]] = []
         if emulation is not None and file.simulated_cameras:
             cameras = list(emulation.bench.cameras)
         else:
             for device, nominal in zip(file.cameras, scene.cameras, strict=True):
                 assert isinstance(device, GenicamDevice) and file.sensor is not None  # the rig file's own check
-                camera = open_camera(file, device, (nominal.height, nominal.width))
+                camera = open_camera(device, file.sensor, (nominal.height, nominal.width))
                 opened.callback(camera.close)
-                require_black(camera, file.sensor)
+                black.append(partial(require_black, camera, file.sensor))
                 cameras.append(camera)
         yield SerialRig(
             Connector(file, clock, emulation, logs).connect,
@@ -247,6 +240,7 @@ def assembled(
             timebase=emulation.bench if emulation is not None and file.simulated_cameras else None,
             announce=twin.announce if twin is not None and file.simulated_cameras else None,
             centre=file.board.centre,
+            in_the_dark=lambda: [measure() for measure in black],
         )
 
 

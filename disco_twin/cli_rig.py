@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Generator
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +12,8 @@ import typer
 from rich.console import Console
 
 from hw.errors import InputError
+from hw.signals import interruptible
+from pipeline.capture.loop import Interrupted
 
 if TYPE_CHECKING:
     from disco_twin.rig_commands import Finding
@@ -83,11 +86,18 @@ def _loaded(path: Path, scene: Path | None) -> tuple[DevicesFile, RigConfig | No
     return file, rig
 
 
-def _show(findings: Iterable[Finding]) -> None:
+def _show(findings: Generator[Finding, None, None]) -> None:
+    """Print them as they come. Whatever ends that, a signal or a closed pipe, what they use is made safe first."""
     good, count = True, 0
-    for finding in findings:
-        console.print(str(finding), highlight=False, markup=False, soft_wrap=True)
-        good, count = good and finding.good, count + 1
+    with interruptible() as interruption, closing(findings):
+        try:
+            for finding in findings:
+                if interruption.stopped:  # and a device's failure on the way out hid it
+                    raise KeyboardInterrupt
+                console.print(str(finding), highlight=False, markup=False, soft_wrap=True)
+                good, count = good and finding.good, count + 1
+        except KeyboardInterrupt:
+            raise Interrupted("stopped: gates and lamps were told off, and every laser that was on") from None
     if not count:
         console.print("every device of this rig file is emulated or simulated: there is nothing to connect to")
     if not good:

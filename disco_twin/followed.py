@@ -97,12 +97,8 @@ class PlacedTable:
         """Where it stands."""
         return self.direction * (self.table.angle_rad() - self.zero_rad) % (2 * np.pi)
 
-    def stop(self) -> None:
-        """Stop at once."""
-        self.table.stop()
-
     def close(self) -> None:
-        """Give the port back."""
+        """Stop, and give the port back."""
         self.table.close()
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from disco_twin.assembly import Connector, free_line, open_camera, require_black
 from disco_twin.folder import require_folder, write_atomically
 from disco_twin.rig_file import EMULATED, DevicesFile, GenicamDevice, LaserDevice
-from hw.clock import WallClock
+from hw.clock import Clock, WallClock
 from hw.devices.mm_ard import ADC_TOP
 from hw.devices.omicron import OmicronLaser
 from hw.errors import DeviceFault, DiscoError, InputError
 from hw.interface import Aim
-from hw.rig import DARK_COUNTS
+from hw.rig import DARK_COUNTS, cut_light
 from hw.trusted_board import TrustedBoard
 from hw.wiring import Board
 from pipeline.rig import RigConfig
@@ -67,30 +67,50 @@ C = TypeVar("C", bound=Closable)
 
 
 @contextmanager
-def _using(device: C) -> Iterator[C]:
-    """The device, closed at the end. What fails in closing never takes the place of what went wrong before.
+def _then(end: Callable[[], None]) -> Iterator[None]:
+    """Something, and then this, whatever happened. What fails in it never takes the place of what went wrong before.
 
     At Ctrl-C a laser's guard is faster than we are, and closing fails: that must not look like a test that failed,
     after which the next laser would be tried.
     """
     try:
-        yield device
+        yield
     except BaseException:
         try:
-            device.close()
+            end()
         except DiscoError as error:
             log.info("closing: %s", error)
         raise
-    device.close()
+    end()
 
 
 @contextmanager
-def _shut_after(board: Board) -> Iterator[None]:
-    try:
-        yield
-    finally:
+def _using(device: C) -> Iterator[C]:
+    """The device, closed at the end."""
+    with _then(device.close):
+        yield device
+
+
+@contextmanager
+def _light(clock: Clock, board: Board, head: OmicronLaser) -> Iterator[Callable[[], None]]:
+    """A laser and its gate, and how both are told to go dark: so they are at once when anything goes wrong.
+
+    In the end the laser is closed first, which one that does not answer draws out for seconds, then the lines are shut.
+    """
+
+    def cut() -> None:
+        cut_light(clock, board, [head])
+
+    def shut() -> None:
         board.when_lost(lambda: None)  # the laser that would be told is closed by now
         board.shut()
+
+    with _then(shut), _using(head):
+        try:
+            yield cut
+        except BaseException:
+            cut()
+            raise
 
 
 def _connector(file: DevicesFile, logs: Path | None) -> Connector:
@@ -109,7 +129,7 @@ def _shapes(file: DevicesFile, scene: RigConfig | None) -> list[tuple[GenicamDev
     return [(camera, sizes[camera.name]) for camera in cameras]
 
 
-def probe(file: DevicesFile, scene: RigConfig | None, logs: Path | None = None) -> Iterator[Finding]:
+def probe(file: DevicesFile, scene: RigConfig | None, logs: Path | None = None) -> Generator[Finding, None, None]:
     """Connect to every real device and let it say what it is. Lasers are switched off and gates shut by that."""
     connect = _connector(file, logs)
 
@@ -147,11 +167,13 @@ def _metered(connect: Connector) -> float:
 
 def _camera_says(file: DevicesFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
     assert file.sensor is not None
-    with _using(open_camera(file, device, shape)) as camera:
+    with _using(open_camera(device, file.sensor, shape)) as camera:
         return camera.grabber.identity()
 
 
-def selftest(file: DevicesFile, scene: RigConfig | None, armed: bool, logs: Path | None = None) -> Iterator[Finding]:
+def selftest(
+    file: DevicesFile, scene: RigConfig | None, armed: bool, logs: Path | None = None
+) -> Generator[Finding, None, None]:
     """Exercise every real device. Lasers emit, one behind an open gate at a time, only if `armed`."""
     connect = _connector(file, logs)
     real = [i for i, laser in enumerate(file.lasers) if laser.port != EMULATED]
@@ -209,7 +231,7 @@ def _test_table(connect: Connector) -> str:
 
 def _test_camera(file: DevicesFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
     assert file.sensor is not None
-    with _using(open_camera(file, device, shape)) as camera:
+    with _using(open_camera(device, file.sensor, shape)) as camera:
         black = require_black(camera, file.sensor)
         for _ in range(FRAMES):
             camera.expose()
@@ -248,8 +270,9 @@ def _test_off(connect: Connector, index: int) -> str:
 def _test_laser(connect: Connector, board: Board, index: int) -> str:
     """Emission behind its shut gate, then through it, against the set point; then off, gate open, against darkness."""
     file, wiring = connect.file, connect.file.lasers[index]
-    with _shut_after(board), _using(connect.omicron(index)) as head:  # left in reverse: the laser first
-        trusted = TrustedBoard(board, connect.clock, [laser.gate_line for laser in file.lasers], _cut(board, head))
+    head = connect.omicron(index)
+    with _light(connect.clock, board, head) as cut:
+        trusted = TrustedBoard(board, connect.clock, [laser.gate_line for laser in file.lasers], cut)
         trusted.require_lines()
         trusted.aim(*file.board.centre)
         trusted.switch(free_line(file), True)
@@ -274,19 +297,6 @@ def _test_laser(connect: Connector, board: Board, index: int) -> str:
 def _meter_says(watts: float, counts: int) -> str:
     """The power meter's reading, and the watts_per_count that it asks for."""
     return f", power meter {1e3 * watts:.2f} mW: watts_per_count = {watts / max(counts, 1):.4g}"
-
-
-def _cut(board: Board, head: OmicronLaser) -> Callable[[], None]:
-    """Tells board and laser to go dark, without waiting for answers; a device that fails does not stop the other."""
-
-    def cut() -> None:
-        for tell in (board.shut_now, head.off_now):
-            try:
-                tell()
-            except DiscoError as error:
-                log.error("cutting the light: %s", error)
-
-    return cut
 
 
 def _require_dark(board: TrustedBoard, wiring: LaserDevice, name: str, state: str, remedy: str) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 
@@ -38,6 +40,28 @@ class VirtualClock:
     def sleep(self, seconds: float) -> None:
         """Move on at once."""
         self._now += max(0.0, seconds)
+
+
+def side_by_side(clock: Clock, steps: Sequence[Callable[[], None]]) -> None:
+    """Take steps that wait, and do not raise, at the same time: all of them take no longer than the longest.
+
+    One after the other on a virtual clock, where no wait takes any time and one would count as every other's.
+    """
+    here, threads = list(steps), []
+    if not isinstance(clock, VirtualClock):
+        here, others = here[:1], here[1:]
+        for step in others:
+            thread = threading.Thread(target=step)
+            try:
+                thread.start()
+            except RuntimeError:  # the system gives no thread any more: then in this one
+                here.append(step)
+            else:
+                threads.append(thread)
+    for step in here:
+        step()
+    for thread in threads:
+        thread.join()
 
 
 class Timebase(Protocol):

@@ -28,6 +28,8 @@ from types import FrameType
 
 import serial
 
+from hw.signals import ENDING
+
 log = logging.getLogger("guard")
 
 OFF = b"\r?LOf\r"  # Omicron: emission off; the CR ends whatever the program had begun to say
@@ -41,7 +43,6 @@ PATIENCE_S = 5.0  # with what does not confirm: then the user is told
 RETURN_S = 600.0  # how long a laser that was told to emit, or a port that vanished, is not given up
 RETRY_S = 0.2
 READY = b"\x06"
-ENDING = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT})
 FAILURES = (OSError, termios.error)  # of a port; pyserial lets the second through where it empties its buffers
 IS_OFF, UNCONFIRMED, OFF_AS_STOPPED = 0, 1, 3  # exit statuses; 2 is Python's own
 

@@ -9,15 +9,17 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from functools import partial
 from types import TracebackType
 from typing import Self
 
-from hw.clock import Clock, Elapsed, Timebase
+from hw.clock import Clock, Elapsed, Timebase, side_by_side
 from hw.errors import DeviceFault, Refused, SwitchedOff
 from hw.interface import Aim, Camera, Floodlight, Laser, LaserReading, Photodiode, Projector, Turntable
 from hw.rig_parts import AdcPhotodiode, GatedLaser, Mirrors, TtlFloodlight, Turning
+from hw.signals import uninterrupted
 from hw.trusted_board import HEARD_S, TrustedBoard
-from hw.wiring import Devices, LaserWiring
+from hw.wiring import Board, Devices, Head, LaserWiring
 
 log = logging.getLogger(__name__)
 
@@ -43,20 +45,21 @@ class SerialRig:
         timebase: Timebase | None = None,
         announce: Callable[[Sequence[Aim]], None] | None = None,
         centre: tuple[int, int] = (2048, 2048),
+        in_the_dark: Callable[[], object] = lambda: None,
     ) -> None:
         """`connect` shuts every line; if it fails it closes what it opened. `centre`: where the mirrors stand first.
 
         armed: lasers may emit; without it the rig refuses to be entered, before anything is connected.
         armed_line: a TTL line that is high as long as the rig is on: a warning lamp, and the witness that the board has
         not been reset since (it would have forgotten where the mirrors stand). warm_up_s: from emission to the first
-        image; then every laser's own reading must lie within `power_tolerance` of its set point.
+        image; then every laser's own reading must lie within `power_tolerance` of its set point. in_the_dark: what is
+        to be measured, and may be refused, while lasers and lamps are off and the gates shut.
         """
         self._connect, self.wiring, self.clock, self._armed = connect, tuple(wiring), clock, armed
         self.flood_line, self._armed_line, self._announce, self._centre = flood_line, armed_line, announce, centre
-        self._warm_up_s, self._power_tolerance = warm_up_s, power_tolerance
+        self._warm_up_s, self._power_tolerance, self._in_the_dark = warm_up_s, power_tolerance, in_the_dark
         self._timebase: Timebase = Elapsed(clock) if timebase is None else timebase
         self._devices: Devices | None = None
-        self._closing: Devices | None = None  # what `make_safe` has not done with
         self._board: TrustedBoard | None = None
         self.last_open = -1  # the laser whose gate was opened last: whose photodiode is to be read
         self.lasers: Sequence[Laser] = [GatedLaser(self, i) for i in range(len(self.wiring))]
@@ -79,6 +82,7 @@ class SerialRig:
         try:
             gates = [wiring.gate_line for wiring in self.wiring]
             self._board = board = TrustedBoard(devices.board, self.clock, gates, self.cut)
+            self._in_the_dark()
             board.aim(*self._centre)
             devices.table.home()
             if self._armed_line is not None:
@@ -108,24 +112,19 @@ class SerialRig:
         self.make_safe()
 
     def make_safe(self) -> None:
-        """Gates shut, lasers and floodlight off, ports given back. No device's failure stops another's, or is raised.
+        """Gates shut, lasers and lamps off, ports given back. No device's failure stops another's, or is raised.
 
-        First every laser is told, which takes no time; then each device confirms in being closed, which one that has
-        fallen silent can draw out for seconds. The board is told in the first step of being closed. Ctrl-C ends one
-        step, which is tried again after the others, and is raised in the end; where it falls between steps, being
-        called again does the rest.
+        First every laser is told; then each device confirms in being closed, which one that has fallen silent can draw
+        out for seconds. The board is told in the first step of being closed. Ctrl-C waits until all that is done.
         """
-        self._closing = devices = self._devices or self._closing
-        self._devices, self._board, self.last_open = None, None, -1
-        if devices is None:
-            return
-        told: list[Callable[[], None]] = [head.off_now for head in devices.heads]
-        steps = [*told, devices.board.close, *(head.close for head in devices.heads), devices.table.close]
-        again, interruption = _each(steps)
-        _each(again)
-        self._closing = None
-        if interruption is not None:
-            raise interruption
+        with uninterrupted():
+            devices, self._devices, self._board, self.last_open = self._devices, None, None, -1
+            if devices is None:
+                return
+            interruptions = _each(self.clock, [head.off_now for head in devices.heads])
+            closing = [devices.board.close, *(head.close for head in devices.heads), devices.table.close]
+            for interruption in [*interruptions, *_each(self.clock, closing)]:
+                raise interruption
 
     def cut(self) -> None:
         """Tell gates and lasers to go dark without waiting for answers; the rig must be entered anew then."""
@@ -133,12 +132,7 @@ class SerialRig:
             return
         if self._board is not None:
             self._board.distrusted = True
-        for tell in (self._devices.board.shut_now, *(head.off_now for head in self._devices.heads)):
-            try:
-                tell()
-            except Exception as error:  # noqa: BLE001 - the others must be told
-                log.error("cutting the light: %s", error)
-        self.clock.sleep(HEARD_S)
+        cut_light(self.clock, self._devices.board, self._devices.heads)
 
     @property
     def connected(self) -> bool:
@@ -213,18 +207,27 @@ class SerialRig:
             raise Refused(f"the {what} must not move while the gate of laser {self.open_gate} is open")
 
 
-def _each(steps: Sequence[Callable[[], None]]) -> tuple[list[Callable[[], None]], BaseException | None]:
-    """Take every step, whatever the others raise. Which of them were interrupted, and by what."""
-    again: list[Callable[[], None]] = []
-    interruption: BaseException | None = None
-    for step in steps:
+def cut_light(clock: Clock, board: Board, heads: Sequence[Head]) -> None:
+    """Tell gates and lasers to go dark, without waiting for answers; returns when they have heard it."""
+    interruptions = _each(clock, [board.shut_now, *(head.off_now for head in heads)])
+    clock.sleep(HEARD_S)
+    for interruption in interruptions:
+        raise interruption
+
+
+def _each(clock: Clock, steps: Sequence[Callable[[], None]]) -> list[BaseException]:
+    """Take every step, whatever the others raise, and at once where the clock is real. What interrupted any of them."""
+    interruptions: list[BaseException] = []
+
+    def attempt(step: Callable[[], None]) -> None:
         try:
             step()
         except SwitchedOff as error:
             log.info("making the rig safe: %s", error)  # its guard was faster, and speaks up if it fails
-        except Exception as error:  # noqa: BLE001 - the steps that follow matter more
+        except Exception as error:  # noqa: BLE001 - the other devices matter more
             log.error("making the rig safe: %s", error)
         except BaseException as error:  # noqa: BLE001 - raised when the other devices are off
-            again.append(step)
-            interruption = error
-    return again, interruption
+            interruptions.append(error)
+
+    side_by_side(clock, [partial(attempt, step) for step in steps])
+    return interruptions

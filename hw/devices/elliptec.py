@@ -166,11 +166,8 @@ class ElliptecTable:
         """Where it stands, 0 .. 2 pi."""
         return float(2.0 * np.pi * (self._position() / self._pulses % 1.0))
 
-    def stop(self) -> None:
-        """An Elliptec stage cannot be stopped; its moves take a second or two."""
-
     def close(self) -> None:
-        """Give the port back."""
+        """Give the port back; a move that has begun goes on, since the stage knows no stopping: a second or two."""
         self.link.close()
 
 

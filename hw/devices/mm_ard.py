@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 from hw.errors import DeviceRefused, Garbled, InputError, NoAnswer, WrongDevice
 from hw.serial_link import Inbox, Link, persist
+from hw.signals import uninterrupted
 
 BAUD = 57_600
 BOOT_S = 2.0  # opening the port resets the board
@@ -191,8 +192,9 @@ class MirrorBoard:
         return min(high << 8 | low, ADC_TOP)
 
     def close(self) -> None:
-        """Shut every line as far as the board still listens, and give the port back."""
-        try:
-            self.shut()
-        finally:
-            self.link.close()
+        """Shut every line as far as the board still listens, and give the port back; Ctrl-C waits until then."""
+        with uninterrupted():
+            try:
+                self.shut()
+            finally:
+                self.link.close()

@@ -17,6 +17,7 @@ from typing import NoReturn, TypeVar
 from hw.devices.omicron_protocol import FAULTS, LEVELS, Mode, OmicronFramer, Status
 from hw.errors import DeviceError, DeviceFault, DeviceRefused, Garbled, NoAnswer, WrongDevice
 from hw.serial_link import Inbox, Link, persist
+from hw.signals import uninterrupted
 
 log = logging.getLogger(__name__)
 
@@ -178,13 +179,6 @@ class OmicronLaser:
         """The stored set point as a share of the maximum power."""
         return self._bits("GLP") / LEVELS
 
-    def temperatures_c(self) -> tuple[float | None, float | None]:
-        """Diode and ambient temperature; None where the laser has no sensor."""
-        diode, ambient = (
-            self._ask(letters, "", lambda a: None if a.startswith("x") else float(a)) for letters in ("MTD", "MTA")
-        )
-        return diode, ambient
-
     def require_ready(self) -> None:
         """Refuse to go on with an open interlock, a turned key or any failure."""
         faults = self.faults()
@@ -316,11 +310,12 @@ class OmicronLaser:
         self.force_off()
 
     def close(self) -> None:
-        """Switch off as far as the laser still listens, and give the port back."""
-        try:
-            self.force_off()
-        finally:
-            self.link.close()
+        """Switch off as far as the laser still listens, and give the port back; Ctrl-C waits until then."""
+        with uninterrupted():
+            try:
+                self.force_off()
+            finally:
+                self.link.close()
 
     def _set_power(self, share: float) -> None:
         """TPP (not stored), or SLP where TPP is unknown."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntFlag
 
-USB_BAUD, RS232_BAUD = 500_000, 57_600
+USB_BAUD = 500_000
 LEVELS = 0xFFF  # of SLP and GLP: 100 %
 
 

@@ -26,10 +26,8 @@ class Table(Protocol):
     def angle_rad(self) -> float:
         """Where it stands, 0 .. 2 pi."""
 
-    def stop(self) -> None:
-        """Stop at once."""
-
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Stop as far as the table can, and give the port back."""
 
 
 def degrees_of(angle_rad: float) -> float:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hw.devices.turning import POLL_S, degrees_of, not_reached
-from hw.errors import DeviceFault, DeviceRefused, Garbled, NoAnswer, WrongDevice
+from hw.errors import DeviceError, DeviceFault, DeviceRefused, Garbled, NoAnswer, WrongDevice
 from hw.serial_link import Inbox, Link, persist
 
 log = logging.getLogger(__name__)
@@ -217,9 +217,15 @@ class ZaberTable:
         return float(np.deg2rad(self._number("pos") / self.microsteps_per_deg % 360.0))
 
     def stop(self) -> None:
-        """Stop at once."""
+        """Stop at once; that a move was interrupted by this is no fault to be reported later."""
         self.ask("stop")
+        self.ask("warnings clear")
 
     def close(self) -> None:
-        """Give the port back; a table that stands still is safe."""
-        self.link.close()
+        """Stop, should a move have been interrupted, as far as the table still listens, and give the port back."""
+        try:
+            self.stop()
+        except DeviceError as error:
+            log.info("closing the turntable: %s", error)
+        finally:
+            self.link.close()

@@ -44,7 +44,13 @@ class _Signals:
 
     def __init__(self) -> None:
         self._pair: tuple[socket.socket, socket.socket] | None = None
+        self._lock = threading.Lock()  # lasers are closed side by side
         self.guards = 0  # that look
+
+    def count(self, more: int) -> None:
+        """So many guards more look, or fewer."""
+        with self._lock:
+            self.guards += more
 
     def reader(self) -> int:
         """The descriptor to look at."""
@@ -83,7 +89,7 @@ class Serial(SerialBase):
         """Start the guard, which opens the port and says off."""
         self._rescued = False
         self._host = self._start()
-        _SIGNALS.guards += 1
+        _SIGNALS.count(1)
         self._host.settimeout(START_S)
         try:
             said = self._host.recv(1)  # what follows READY is the laser's
@@ -172,7 +178,7 @@ class Serial(SerialBase):
         self.trip()
         if self._host is not None:
             self._host.close()
-            _SIGNALS.guards -= 1
+            _SIGNALS.count(-1)
         if self._guard is not None:
             try:
                 self._guard.wait(END_S)

@@ -7,17 +7,15 @@ turntable and projector, so that a capture that was interrupted ends with the ve
 from __future__ import annotations
 
 import logging
-import signal
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 
 from hw.errors import DiscoError, InputError
 from hw.interface import Floodlight, Rig, gate_open
 from hw.record import RawImage, Sensor
+from hw.signals import interruptible, uninterrupted
 from pipeline.capture.lasers import DRIFT_SHARE, append_lasers, drifts, read_lasers
 from pipeline.capture.layout import ImageMeta
 from pipeline.capture.plan import ImageAddress, Plan
@@ -51,8 +49,9 @@ def capture(
 ) -> CaptureReport:
     """Take the images of the plan that are not yet stored in the folder. The rig is safe whenever this ends.
 
-    Ctrl-C (or SIGTERM, SIGHUP) is obeyed at once, since lasers must go out: the image in progress is dropped, to be
-    taken again, and `Interrupted` raised. The folder of another plan is refused before the rig is switched on.
+    Ctrl-C (or another signal of `hw.signals`) is obeyed at once, since lasers must go out: the image in progress is
+    dropped, to be taken again, and `Interrupted` raised. The folder of another plan is refused before the rig is
+    switched on.
     With a `sensor`, a rig that has moved since the capture was interrupted is refused (`pipeline.capture.reference`).
     """
     _require_match(rig, plan)
@@ -60,19 +59,19 @@ def capture(
         resumed_at = len(stream)
         if not stream.complete:
             log.info("capture: image %d of %d into %s", resumed_at, len(plan), folder)
-            with _Signals() as signals:
+            with interruptible() as interruption:
                 try:
                     with rig:
                         _restore(rig, stream, sensor)
-                        _sweep(rig, stream, signals, progress)
+                        _sweep(rig, stream, progress)
                 except KeyboardInterrupt:
                     raise _interrupted(stream) from None
                 except DiscoError:
-                    if signals.stopped:  # what fails on the way out does not matter any more
+                    if interruption.stopped:  # what fails on the way out does not matter any more
                         raise _interrupted(stream) from None
                     raise
                 finally:
-                    signals.ignore()
+                    interruption.ignoring = True
                     rig.make_safe()  # once more: entering the rig may have failed half-way, leaving it been interrupted
     with StreamReader(folder) as stored:
         raw, size = stored.bytes_raw(), stored.bytes_stored
@@ -87,13 +86,13 @@ def _require_match(rig: Rig, plan: Plan) -> None:
         raise InputError("the plan is for other lasers", key="lasers", value=len(rig.lasers), allowed=str(plan.lasers))
 
 
-def _sweep(rig: Rig, stream: StreamWriter, signals: _Signals, progress: Progress | None) -> None:
+def _sweep(rig: Rig, stream: StreamWriter, progress: Progress | None) -> None:
     plan = stream.plan
     announced = checked = None
     for index in range(len(stream), len(plan)):
         address = plan.address(index)
         if checked != address.view:
-            _check_lasers(rig, stream, address.view, signals)
+            _check_lasers(rig, stream, address.view)
             checked = address.view
         if address.kind == "silhouette":
             rig.turntable.move(plan.angles_rad[plan.angle_of(address.view)])
@@ -101,16 +100,16 @@ def _sweep(rig: Rig, stream: StreamWriter, signals: _Signals, progress: Progress
             rig.announce([plan.spots[i] for i in plan.spots_at(plan.angle_of(address.view))])
             announced = address.view
         image = _take(rig, plan, address)
-        with signals.held():
+        with uninterrupted():
             stream.append(address, *image)
         if progress is not None:
             progress(index + 1, len(plan))
 
 
-def _check_lasers(rig: Rig, stream: StreamWriter, view: int, signals: _Signals) -> None:
+def _check_lasers(rig: Rig, stream: StreamWriter, view: int) -> None:
     """Before a view, in the dark; what is beyond the rig's tolerance is refused by the rig, what drifts is marked."""
     readings = rig.check()
-    with signals.held():
+    with uninterrupted():
         append_lasers(stream.folder, view, rig.now(), readings)
     drift = drifts(read_lasers(stream.folder)).get(view, 0.0) if readings else 0.0
     if drift > DRIFT_SHARE:
@@ -163,51 +162,3 @@ def _lit(floodlight: Floodlight) -> Iterator[None]:
 def _interrupted(stream: StreamWriter) -> Interrupted:
     done, total = len(stream), len(stream.plan)
     return Interrupted(f"stopped: {done} of {total} images are stored; the same command continues")
-
-
-class _Signals:
-    """Turns SIGINT, SIGTERM and SIGHUP into KeyboardInterrupt, once, but not while an image is being stored.
-
-    What follows the first is the end of the capture, and nothing interrupts that. A signal that is ignored already
-    (nohup) stays so. Outside the main thread Python delivers no signals, and this does nothing.
-    """
-
-    def __init__(self) -> None:
-        self._before: dict[signal.Signals, signal._HANDLER] = {}
-        self._holding = self._asked = self._ignoring = self.stopped = False
-
-    def __enter__(self) -> _Signals:
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                if signal.getsignal(number) not in (signal.SIG_IGN, None):
-                    self._before[number] = signal.signal(number, self._handle)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self._holding:
-            self._asked = True
-        elif not self._ignoring:
-            self._stop()
-
-    def _stop(self) -> None:
-        self._ignoring = self.stopped = True
-        raise KeyboardInterrupt
-
-    def ignore(self) -> None:
-        """From here on nothing interrupts: the rig is being made safe."""
-        self._ignoring = True
-
-    @contextmanager
-    def held(self) -> Iterator[None]:
-        """A block that is not interrupted; a signal that arrives in it counts at its end."""
-        self._holding = True
-        try:
-            yield
-        finally:
-            self._holding = False
-        if self._asked:
-            self._stop()

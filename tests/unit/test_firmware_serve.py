@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import sys
+import time
 import types
 import warnings
 from collections.abc import Iterator
@@ -25,10 +26,12 @@ from disco_twin.firmware.turning import Spindle
 from disco_twin.firmware.wire import Line
 from disco_twin.firmware.zaber import MICROSTEPS_PER_DEG, ZaberFirmware
 from disco_twin.rig import TwinRig
+from disco_twin.rig_commands import emulated_devices
 from hw.bytelog import ByteLog, ReplayPeer, read_log
 from hw.clock import VirtualClock
 from hw.devices.mm_ard import MirrorBoard
 from hw.devices.omicron import OmicronLaser
+from hw.devices.omicron_protocol import Mode
 from hw.devices.zaber import ZaberTable
 from hw.errors import Unplugged
 from hw.ports.protocol_memory import attach
@@ -54,6 +57,23 @@ def served(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Des
     desk = Desk()
     with Server(desk.lines, tmp_path if request.param == "terminals" else None) as server:
         yield desk, server
+
+
+@pytest.mark.parametrize("through", ["terminals", "sockets"])
+def test_a_laser_whose_port_nobody_holds_is_seen_on_sockets_alone(tmp_path: Path, through: str) -> None:
+    """A terminal does not say when it is closed (decision 0036): what stands in for it must not rely on this."""
+    emulated = emulated_devices(RIG, seed=1)
+    head = emulated.bench.heads[0]
+    with Server({"laser0": emulated.lines["laser0"]}, tmp_path if through == "terminals" else None) as server:
+        head.mode, head.level, head.on_since = int(Mode.BIAS | Mode.RELEASE), 1.0, time.monotonic() - 60.0
+        with serial.serial_for_url(server.urls["laser0"], timeout=2.0) as port:
+            port.write(b"?GAS\r")
+            assert port.read_until(b"\r") == b"!GAS02C2\r"
+        end = time.monotonic() + 2.0
+        while through == "sockets" and not emulated.bench.hazards and time.monotonic() < end:
+            time.sleep(0.01)
+    expected = ["laser 0 emits and nobody holds its port"] if through == "sockets" else []
+    assert emulated.bench.hazards == expected
 
 
 def test_drivers_work_through_terminals_and_sockets(served: tuple[Desk, Server]) -> None:

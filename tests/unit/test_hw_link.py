@@ -241,7 +241,7 @@ def test_what_is_no_log_is_refused_in_one_line(tmp_path: Path, text: str) -> Non
 def exercise_laser(laser: OmicronLaser) -> tuple[object, ...]:
     laser.arm(20.0)
     laser.emit()
-    result = (laser.identity, laser.measured_mw(), laser.status(), laser.temperatures_c())
+    result = (laser.identity, laser.measured_mw(), laser.status(), laser.mode())
     laser.close()
     return result
 

@@ -258,3 +258,28 @@ def test_elliptec_wire_format() -> None:
     assert firmware.feed(b"1gs", 4.0) == []
     assert firmware.feed(b"0m", 4.0) == []
     assert firmware.feed(b"0gs", 7.0)[0][1] == b"0GS01\r\n"
+
+
+def test_closing_stops_a_move_that_was_interrupted_and_is_no_fault_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C while somebody's sleeve is in the table."""
+    bench = TableBench()
+    table = bench.connect()
+    table.home()
+    begun, sleep = bench.now(), bench.clock.sleep
+
+    def interrupted(seconds: float) -> None:
+        sleep(seconds)
+        if bench.now() > begun + 0.3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(bench.clock, "sleep", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        table.move(np.deg2rad(180))
+    monkeypatch.undo()
+    assert bench.spindle.busy(bench.now())
+    table.close()
+    assert not bench.spindle.busy(bench.now()) and 0.0 < degrees(bench) < 170.0
+    again = bench.connect()
+    again.home()
+    again.move(np.deg2rad(90))
+    assert degrees(bench) == pytest.approx(90.0, abs=0.003)

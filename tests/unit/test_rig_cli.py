@@ -97,7 +97,7 @@ def test_probe_and_selftest_of_served_devices(
 def test_ctrl_c_in_a_selftest_does_not_go_on_to_the_next_laser(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The guard closes its port at the signal, so that closing the laser fails."""
     monkeypatch.setattr("hw.devices.mm_ard.BOOT_S", 0.05)
-    tried = []
+    tried, told = [], []
 
     class Head:
         name = "laser 635 nm"
@@ -111,6 +111,9 @@ def test_ctrl_c_in_a_selftest_does_not_go_on_to_the_next_laser(tmp_path: Path, m
         def emit(self) -> None:
             raise KeyboardInterrupt
 
+        def off_now(self) -> None:
+            told.append(True)
+
         def close(self) -> None:
             if tried:
                 raise SwitchedOff("guard://laser0", "the port of the laser", "is closed", "none")
@@ -120,7 +123,7 @@ def test_ctrl_c_in_a_selftest_does_not_go_on_to_the_next_laser(tmp_path: Path, m
         findings = selftest(load_rig_file(path), None, armed=True)
         with pytest.raises(KeyboardInterrupt):
             list(findings)
-    assert tried == [10.0]
+    assert tried == [10.0] and told
 
 
 def test_no_gate_is_tested_where_a_laser_may_be_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,11 +188,14 @@ def test_a_laser_that_says_off_and_emits_is_not_let_out(
     [
         ("leaks", "emits behind its shut gate, and its photodiode reads"),
         ("saturates", "saturates its photodiode (1023 counts"),
+        ("reset", "it was reset"),
     ],
 )
 def test_an_armed_selftest_finds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str, says: str) -> None:
-    """A gate that lets light through; an amplifier at its end."""
-    bench = quick(monkeypatch).bench
+    """A gate that lets light through; an amplifier at its end; a board that is reset between lamp and gate."""
+    devices = quick(monkeypatch)
+    bench = devices.bench
+    start = bench.heads[0].on_start
     lit = bench.board.sample
     gates: list[int] = []
     set_pattern = bench.board.set_pattern
@@ -201,8 +207,14 @@ def test_an_armed_selftest_finds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         set_pattern(pattern)
         gates.append(pattern & 0b111)
 
+    def reset_at_start() -> None:
+        start()
+        devices.lines["board"].power_cycle()
+
     if fault == "leaks":
         monkeypatch.setattr(bench.board, "sample", leak)
+    elif fault == "reset":
+        monkeypatch.setattr(bench.heads[0], "on_start", reset_at_start)
     elif fault == "saturates":
         monkeypatch.setattr(bench.board, "sample", lambda pin: 1023 if lit(pin) else 0)
     monkeypatch.setattr(bench.board, "set_pattern", pattern_set)

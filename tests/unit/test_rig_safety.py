@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -324,7 +325,7 @@ def test_no_failure_of_a_step_keeps_the_rig_from_being_made_safe() -> None:
 
 @pytest.mark.parametrize("step", ["off_now", "board", "head", "table"])
 def test_ctrl_c_while_the_rig_is_made_safe_leaves_no_device_open(step: str) -> None:
-    """It ends one step and comes out at the end; every device is closed. Called again, nothing is left."""
+    """It is heard in the end; every device is closed before. Called again, nothing is left."""
     emulated = emulation()
     rig = emulated.serial_rig()
     rig.__enter__()
@@ -336,7 +337,7 @@ def test_ctrl_c_while_the_rig_is_made_safe_leaves_no_device_open(step: str) -> N
         def spied(name: str = name, close: Callable[[], None] = close) -> None:
             if step == name and not pressed:
                 pressed.append(name)
-                raise KeyboardInterrupt
+                signal.raise_signal(signal.SIGINT)
             close()
             closed.append(name)
 
@@ -347,7 +348,7 @@ def test_ctrl_c_while_the_rig_is_made_safe_leaves_no_device_open(step: str) -> N
     def off_spied() -> None:
         if step == "off_now" and not pressed:
             pressed.append(step)
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
         off_now()
 
     setattr(devices.heads[0], "off_now", off_spied)  # noqa: B010 - the same
@@ -374,3 +375,20 @@ def test_a_guard_that_ends_while_lasers_warm_up_ends_it_at_once(monkeypatch: pyt
         pass
     assert emulated.clock.now() - begun < 110
     assert emulated.bench.light() == [] and not any(head.on_since for head in emulated.bench.heads)
+
+
+def test_what_interrupts_one_step_though_signals_wait_leaves_no_other_device_open() -> None:
+    """Another signal's handler, of a script, may raise what it likes."""
+    emulated = emulation()
+    rig = emulated.serial_rig()
+    rig.__enter__()
+    devices = rig.devices()
+
+    def ended() -> None:
+        raise SystemExit
+
+    devices.heads[0].off_now = ended  # type: ignore[method-assign]
+    with pytest.raises(SystemExit):
+        rig.make_safe()
+    assert emulated.bench.board.lines == 0 and not any(head.on_since for head in emulated.bench.heads)
+    assert not rig.connected and not any(line._users for line in emulated.lines.values())
