@@ -170,13 +170,13 @@ def plan(scene: SceneFile, profile: ProfileOption = "full") -> None:
     """Predict images, bytes and time of a scene, and say what it leaves out. Needs no renderer."""
     from disco_twin.predict import predict
     from disco_twin.scene import load_scene
-    from disco_twin.simulate import require_capturable
+    from disco_twin.simulate import require_capturable, shipped_references
     from disco_twin.world import World
 
     with naming(scene):
         world = World(load_scene(scene, profile))
         require_capturable(world)
-        lines = predict(world)
+        lines = predict(world, shipped_references(scene, world.scene.name))
     for name, value in lines:
         console.print(f"  {name:<12} {value}", highlight=False, soft_wrap=True)
 

@@ -3,34 +3,46 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 from disco_twin.noise import walks_below_camera
+from disco_twin.simulate import holds_reference
 from disco_twin.world import World, left_out_by_the_twin
 from pipeline.capture.targets import make_targets
 from pipeline.resources import usable_cores
 
-# Measured on an earlier quick.toml (alpha .3, mean free path about 1.7 mm, twice today's), per core and second; other
-# media scale with the number of collisions, so this is a guess within a factor of two or three.
-SPOT_WALKS, TRUTH_WALKS, REFERENCE_WALKS = 100_000.0, 50_000.0, 60_000.0
+# Walks per core and second of quick.toml's stages as a run times them, compilation and the images' exposure included
+# (docs/decisions/0052). Other media scale with the number of collisions: there a guess within a factor of two or three.
+SPOT_WALKS, TRUTH_WALKS, REFERENCE_WALKS = 85_000.0, 110_000.0, 140_000.0
 COMPRESSION = 7.0  # docs/decisions/0002
 IMAGES_PER_S = 15.0  # of the real rig (thesis 4.1)
 BYTES_PER_PIXEL = 3
 
 
-def predict(world: World) -> list[tuple[str, str]]:
-    """Lines (name, text) for the user."""
+def simulation_seconds(world: World, lights: int, cores: int) -> dict[str, float]:
+    """Seconds of each stage that walks photons, by the wall clock. lights: how many have references to be rendered.
+
+    Wavelengths that share sigma_t and g share their walks.
+    """
+    work, medium = world.scene.simulation, world.object.medium
+    groups = len({(m.tobytes(), g) for m, g in zip(medium.sigma_t, medium.g, strict=True)})
+    return {
+        "capture": len(world.plan.spots) * work.walks_per_spot * groups / SPOT_WALKS / cores,
+        "truth": work.truth_columns * work.truth_walks * groups / TRUTH_WALKS / cores,
+        "references": lights * work.reference_walks * groups / REFERENCE_WALKS / cores,
+    }
+
+
+def predict(world: World, shipped: Path) -> list[tuple[str, str]]:
+    """Lines (name, text) for the user. shipped: folder of references that are taken instead of rendered."""
     scene, plan = world.scene, world.plan
     images = len(plan)
     pixels = scene.rig.cameras[0].width * scene.rig.cameras[0].height
     raw = images * pixels * BYTES_PER_PIXEL
     work = scene.simulation
-    groups = len({(m.tobytes(), g) for m, g in zip(world.object.medium.sigma_t, world.object.medium.g, strict=True)})
-    cores = usable_cores()
-    seconds = {
-        "capture": plan_walks(world) * groups / SPOT_WALKS / cores,
-        "truth": work.truth_columns * work.truth_walks * groups / TRUTH_WALKS / cores,
-        "references": len(scene.relight.lights) * work.reference_walks * groups / REFERENCE_WALKS / cores,
-    }
+    cores, views = usable_cores(), scene.relight.views
+    lights = sum(not all(holds_reference(shipped, world, x, v) for v in views) for x in scene.relight.lights)
+    seconds = simulation_seconds(world, lights, cores)
     triangles, vertices = len(world.object.mesh.faces), len(world.scan.vertices)
     lines = [
         ("scene", f"{scene.name}: {triangles} triangles, scan of {vertices} vertices"),
@@ -41,7 +53,9 @@ def predict(world: World) -> list[tuple[str, str]]:
     if scene.rig.faults.deviation:
         targets = sum(len(make_targets(scene.rig, c)[1]) for c in range(len(scene.rig.cameras)))
         lines.insert(2, ("calibration", f"{targets} images of chessboards and of a white plate"))
-    lines += [(name, f"about {value / 60:.1f} minutes on {cores} cores") for name, value in seconds.items()]
+    lines += [(name, f"about {value / 60:.1f} minutes on {cores} cores") for name, value in seconds.items() if value]
+    if not lights:
+        lines.append(("references", "none to render: they lie beside the scene"))
     needed = walks_below_camera(scene)
     lines.append(
         (
@@ -53,8 +67,3 @@ def predict(world: World) -> list[tuple[str, str]]:
     )
     lines += [("left out", f"{item['what']}: {item['because']}") for item in left_out_by_the_twin(world)]
     return lines
-
-
-def plan_walks(world: World) -> float:
-    """Photons of all spots together."""
-    return float(len(world.plan.spots) * world.scene.simulation.walks_per_spot)

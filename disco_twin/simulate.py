@@ -153,39 +153,44 @@ def shipped_references(scene_file: Path, name: str) -> Path:
     return scene_file.parent / "references" / name
 
 
+def holds_reference(folder: Path, world: World, light: Light, view: CameraConfig) -> bool:
+    """Whether a folder holds this scene's reference of a light and view, with walks enough."""
+    from disco_twin.light.references import load_reference
+
+    path = reference_path(folder, light, view)
+    if not path.is_file():
+        return False
+    try:
+        found = load_reference(path)
+    except InputError as error:
+        log.warning("%s", error)
+        return False
+    walks = world.scene.simulation.reference_walks
+    return found.key == reference_key(world.scene, light, view) and found.walks >= walks // 2
+
+
 def render_references(world: World, shipped: Path, own: Path, progress: Progress) -> int:
     """Make sure that every reference lies in `own`: taken from `shipped`, kept from before, or rendered now.
 
     Returns how many lights had to be rendered.
     """
-    from disco_twin.light.references import load_reference, save_reference
+    from disco_twin.light.references import save_reference
 
     scene, rendered = world.scene, 0
-    lights, walks = scene.relight.lights, scene.simulation.reference_walks
+    lights = scene.relight.lights
     if own.exists() and not own.is_dir():
         raise InputError("is not a folder", file=own, remedy="choose another --out")
     own.mkdir(parents=True, exist_ok=True)
-
-    def usable(path: Path, key: str) -> bool:
-        if not path.is_file():
-            return False
-        try:
-            found = load_reference(path)
-        except InputError as error:
-            log.warning("%s", error)
-            return False
-        return found.key == key and found.walks >= walks // 2
 
     for done, light in enumerate(lights):
         progress(done, len(lights))
         missing = []
         for view in scene.relight.views:
-            key, name = reference_key(scene, light, view), reference_path(own, light, view)
-            from_shipped = reference_path(shipped, light, view)
-            if usable(name, key):
+            name = reference_path(own, light, view)
+            if holds_reference(own, world, light, view):
                 continue
-            if usable(from_shipped, key):
-                write_atomically(name, from_shipped.read_bytes())
+            if holds_reference(shipped, world, light, view):
+                write_atomically(name, reference_path(shipped, light, view).read_bytes())
             else:
                 missing.append(view)
         for size in sorted({(v.width, v.height) for v in missing}):

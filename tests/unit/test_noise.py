@@ -79,9 +79,9 @@ def test_smoother_boundaries_and_many_cameras_ask_for_more_walks(scene: Scene) -
     assert walks_below_camera(crowd) == pytest.approx(4 * walks)
 
 
-def test_plan_says_how_many_walks(scene: Scene) -> None:
+def test_plan_says_how_many_walks(scene: Scene, tmp_path: Path) -> None:
     """Expected behaviour: the plan of the quick scene names its walks, and those that bury their noise."""
-    lines = dict(predict(World(scene)))
+    lines = dict(predict(World(scene), tmp_path))
     assert f"with {scene.simulation.walks_per_spot} walks a spot" in lines["noise"]
     assert f"{walks_below_camera(scene):.1e} bring it below" in lines["noise"]
 
