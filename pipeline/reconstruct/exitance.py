@@ -15,8 +15,9 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.calibrate.fresnel import Boundary, transmittance
-from pipeline.reconstruct.mesh import first_hit, interpolated_normals, interpolation
+from pipeline.reconstruct.mesh import interpolation
 from pipeline.reconstruct.samples import Glow
+from pipeline.reconstruct.seen import see
 
 F64 = NDArray[np.float64]
 
@@ -31,20 +32,17 @@ def _accumulate(mesh: trimesh.Trimesh, glow: Glow, radiosity: F64, eta: float) -
     radiosity: (L, V) expected sum over the view's spots at the vertices, mm^-2
     """
     camera, bins = glow.camera, len(EDGES) - 1
-    origins, directions = camera.rays(camera.pixel_centres(SUPERSAMPLE))
-    hit = first_hit(mesh, origins, directions)
-    index = np.flatnonzero(hit.triangle >= 0)
-    triangle, barycentric = hit.triangle[index], hit.barycentric[index]
-    cosine = -(interpolated_normals(mesh, triangle, barycentric) * directions[index]).sum(axis=1)
-    row, column = np.divmod(index, camera.width * SUPERSAMPLE)
-    pixel = row // SUPERSAMPLE * camera.width + column // SUPERSAMPLE
-    whole = np.bincount(pixel, minlength=camera.width * camera.height)[pixel] == SUPERSAMPLE**2
-    use = whole & (cosine > 0)
-    at = np.minimum(np.searchsorted(EDGES, cosine[use], side="right") - 1, bins - 1)
-    seen = glow.image.reshape(len(glow.image), -1)[:, pixel[use]].sum(axis=0)
-    model = (interpolation(mesh, triangle[use], barycentric[use]) @ radiosity.T).sum(axis=1)
-    smooth = transmittance(cosine[use], eta)
-    return np.bincount(at, seen, bins).astype(np.float64), np.bincount(at, smooth * model, bins).astype(np.float64)
+    observed, expected = np.zeros(bins), np.zeros(bins)
+    image = glow.image.reshape(len(glow.image), -1)
+    for band in see(mesh, camera, SUPERSAMPLE):
+        whole = np.bincount(band.pixel, minlength=image.shape[1])[band.pixel] == SUPERSAMPLE**2
+        use = np.flatnonzero(whole & (band.cosine > 0))
+        cosine = band.cosine[use]
+        at = np.minimum(np.searchsorted(EDGES, cosine, side="right") - 1, bins - 1)
+        model = (interpolation(mesh, band.triangle[use], band.barycentric[use]) @ radiosity.T).sum(axis=1)
+        observed += np.bincount(at, image[:, band.pixel[use]].sum(axis=0), bins)
+        expected += np.bincount(at, transmittance(cosine, eta) * model, bins)
+    return observed, expected
 
 
 def measure_boundary(

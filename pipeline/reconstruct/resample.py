@@ -23,6 +23,7 @@ from hw.record import RawImage, Sensor, to_radiance
 from pipeline.calibrate.calibration import Calibration
 from pipeline.capture.plan import ImageAddress
 from pipeline.capture.stream import CorruptImage, StreamReader
+from pipeline.reconstruct.seen import window
 from pipeline.reconstruct.views import Reading
 from pipeline.resources import usable_cores
 
@@ -32,7 +33,6 @@ F32 = NDArray[np.float32]
 log = logging.getLogger(__name__)
 
 MIN_SHARE = 0.5  # of a vertex's hat that a camera must see
-AROUND = 2  # pixels around the mesh's outline that still belong to a view's window
 TOGETHER = 32  # images whose sums one thread keeps in single precision
 # (1, -2, 1) x (1, -2, 1) answers white noise of variance s^2 with 36 s^2, and a slope not at all (Immerkaer 1996).
 SECOND_DIFFERENCES = 36.0
@@ -58,16 +58,13 @@ class Sight:
     def of(cls, view: int, calibration: Calibration, mesh: trimesh.Trimesh, readings: Mapping[str, Reading]) -> Sight:
         """The sight of a view by all ways of reading it."""
         camera = calibration.view_camera(view)
-        corner, _ = camera.project(np.asarray(mesh.vertices))
-        x0, y0 = np.maximum(np.floor(corner.min(axis=0)).astype(int) - AROUND, 0).tolist()
-        x1, y1 = (np.ceil(corner.max(axis=0)).astype(int) + AROUND).tolist()
-        window = slice(y0, min(y1, camera.height)), slice(x0, min(x1, camera.width))
-        gain = 1.0 / calibration.vignetting(view)[window]
-        inside = np.arange(camera.height * camera.width).reshape(camera.height, camera.width)[window].ravel()
+        part = window(mesh, camera)
+        gain = 1.0 / calibration.vignetting(view)[part]
+        inside = np.arange(camera.height * camera.width).reshape(camera.height, camera.width)[part].ravel()
         lens = sparse.diags_array(gain.ravel())
         rows = {way: np.flatnonzero(reading.share > MIN_SHARE) for way, reading in readings.items()}
         operators = {way: _single(reading.operator[rows[way]][:, inside] @ lens) for way, reading in readings.items()}
-        return cls(view, window, rows, operators, gain)
+        return cls(view, part, rows, operators, gain)
 
 
 @dataclass

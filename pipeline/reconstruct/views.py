@@ -17,12 +17,12 @@ from scipy import ndimage, sparse
 
 from pipeline.calibrate.camera import PinholeCamera
 from pipeline.calibrate.fresnel import transmittance
-from pipeline.reconstruct.mesh import first_hit, interpolated_normals, vertex_areas
+from pipeline.reconstruct.mesh import first_hit, vertex_areas
+from pipeline.reconstruct.seen import Seen, see
 
 F64 = NDArray[np.float64]
 
 SUPERSAMPLE = 4  # rays per pixel and axis
-BAND = 16  # rows of pixels whose rays are cast together
 JUMP = 8.0  # depth range inside a pixel, in pixel widths on the surface, that betrays a discontinuity
 
 
@@ -55,71 +55,34 @@ class Pixels:
     cosine: F64
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """What the rays of one band of the image meet, all of length N: see `Pixels`; distance: mm along the ray."""
-
-    pixel: NDArray[np.int64]
-    triangle: NDArray[np.int64]
-    barycentric: F64
-    distance: F64
-    area: F64
-    cosine: F64
-    flat: F64
-
-
 def see_surface(mesh: trimesh.Trimesh, camera: PinholeCamera, max_view_deg: float) -> Pixels:
     """The samples whose whole pixel, and its neighbours, show one continuous piece of surface, not too obliquely."""
     s, shape = SUPERSAMPLE, (camera.height, camera.width)
-    rows, columns = _in_sight(mesh, camera)
     bands = [
-        _see_band(mesh, camera, slice(row, min(row + BAND, rows.stop)), columns)
-        for row in range(rows.start, rows.stop, BAND)
+        (b.pixel, b.triangle, b.barycentric, b.distance, b.cosine, *_area(mesh, camera, b))
+        for b in see(mesh, camera, s)
     ]
-    names = _Seen.__dataclass_fields__
-    seen = _Seen(**{name: np.concatenate([getattr(band, name) for band in bands]) for name in names})
-    count = np.bincount(seen.pixel, minlength=shape[0] * shape[1])
+    pixel, triangle, barycentric, distance, cosine, area, flat = (np.concatenate(x) for x in zip(*bands, strict=True))
+    count = np.bincount(pixel, minlength=shape[0] * shape[1])
     near, far = np.full(count.shape, np.inf), np.full(count.shape, -np.inf)
-    np.minimum.at(near, seen.pixel, seen.distance)
-    np.maximum.at(far, seen.pixel, seen.distance)
-    width = np.median(seen.distance) / camera.focal.mean() if len(seen.distance) else 1.0
+    np.minimum.at(near, pixel, distance)
+    np.maximum.at(far, pixel, distance)
+    width = np.median(distance) / camera.focal.mean() if len(distance) else 1.0
     broken = (count > 0) & (far - near > JUMP * width)
     unsafe = ndimage.binary_dilation((broken | (count < s * s)).reshape(shape), np.ones((3, 3), bool)).ravel()
-    facing = np.minimum(seen.cosine, seen.flat) > np.cos(np.deg2rad(max_view_deg))
-    keep = np.flatnonzero(~unsafe[seen.pixel] & facing)
-    vertices = mesh.faces[seen.triangle[keep]]
-    return Pixels(seen.pixel[keep], vertices, seen.barycentric[keep], seen.area[keep], seen.cosine[keep])
+    facing = np.minimum(cosine, flat) > np.cos(np.deg2rad(max_view_deg))
+    keep = np.flatnonzero(~unsafe[pixel] & facing)
+    vertices = mesh.faces[triangle[keep]]
+    return Pixels(pixel[keep], vertices, barycentric[keep], area[keep], cosine[keep])
 
 
-def _in_sight(mesh: trimesh.Trimesh, camera: PinholeCamera) -> tuple[slice, slice]:
-    """The (rows, columns) of the image that can show the mesh: not empty, and all of it where that is not certain."""
-    corner, depth = camera.project(np.asarray(mesh.vertices))
-    if not (np.isfinite(corner).all() and (depth > 0).all()):
-        return slice(0, camera.height), slice(0, camera.width)
-    size = np.array([camera.width, camera.height])
-    low = np.clip(np.floor(corner.min(axis=0)).astype(int) - 1, 0, size - 1)
-    high = np.clip(np.ceil(corner.max(axis=0)).astype(int) + 1, low + 1, size)
-    return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
-
-
-def _see_band(mesh: trimesh.Trimesh, camera: PinholeCamera, rows: slice, columns: slice) -> _Seen:
-    """Some rows of pixels at a time: what is worked out for their rays stays in the cache."""
-    s = SUPERSAMPLE
-    row = np.arange(rows.start * s, rows.stop * s)
-    column = np.arange(columns.start * s, columns.stop * s)
-    centres = np.stack(np.meshgrid((column + 0.5) / s, (row + 0.5) / s), axis=-1).reshape(-1, 2)
-    origins, directions = camera.rays(centres)
-    hit = first_hit(mesh, origins, directions)
-    index = np.flatnonzero(hit.triangle >= 0)
-    triangle, barycentric = hit.triangle[index], hit.barycentric[index]
-    direction, distance = directions[index], hit.distance[index]
-    cosine = -np.einsum("ni,ni->n", interpolated_normals(mesh, triangle, barycentric), direction)
-    flat = -np.einsum("ni,ni->n", mesh.face_normals[triangle], direction)
-    pixel = row[index // len(column)] // s * camera.width + column[index % len(column)] // s
+def _area(mesh: trimesh.Trimesh, camera: PinholeCamera, seen: Seen) -> tuple[F64, F64]:
+    """(N,) mm^2 of surface that each sample stands for, and its cosine with the triangle itself."""
+    flat = -np.einsum("ni,ni->n", mesh.face_normals[seen.triangle], seen.direction)
     # A pinhole's solid angle per sample; distortion changes it by less than the scan's own errors.
-    forward = direction @ camera.pose[2, :3]
-    area = distance**2 * forward**3 / (camera.focal.prod() * s**2) / np.maximum(flat, 0.05)
-    return _Seen(pixel, triangle, barycentric, distance, area, cosine, flat)
+    forward = seen.direction @ camera.pose[2, :3]
+    pixels = camera.focal.prod() * SUPERSAMPLE**2
+    return seen.distance**2 * forward**3 / pixels / np.maximum(flat, 0.05), flat
 
 
 def footprint_reading(mesh: trimesh.Trimesh, camera: PinholeCamera, eta: float, max_view_deg: float) -> Reading:

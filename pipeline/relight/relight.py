@@ -11,7 +11,7 @@ from scipy import sparse
 
 from pipeline.calibrate.camera import PinholeCamera
 from pipeline.calibrate.fresnel import Boundary, transmittance
-from pipeline.reconstruct.mesh import first_hit, interpolated_normals
+from pipeline.reconstruct.seen import see
 
 if TYPE_CHECKING:
     import trimesh
@@ -38,15 +38,10 @@ def view_matrix(
     mesh: trimesh.Trimesh, camera: PinholeCamera, eta: float | Boundary, supersample: int = 4
 ) -> ViewMatrix:
     """Trace supersample^2 rays a pixel; radiosity is linear on the faces. One matrix serves all lights of a view."""
-    origins, directions = camera.rays(camera.pixel_centres(supersample))
-    found = first_hit(mesh, origins, directions)
-    hit = np.flatnonzero(found.triangle >= 0)
-    face, barycentric = found.triangle[hit], found.barycentric[hit]
-    cosine = -(interpolated_normals(mesh, face, barycentric) * directions[hit]).sum(axis=1)
+    bands = [(b.pixel, b.triangle, b.barycentric, b.cosine) for b in see(mesh, camera, supersample)]
+    pixel, face, barycentric, cosine = (np.concatenate(x) for x in zip(*bands, strict=True))
     factor = transmittance(cosine, eta) / np.pi / supersample**2
     width, height = camera.width, camera.height
-    row, column = hit // (width * supersample) // supersample, hit % (width * supersample) // supersample
-    pixel = row * width + column
     weights = (factor[:, None] * barycentric).ravel()
     shape = (width * height, len(mesh.vertices))
     matrix = sparse.csr_matrix((weights, (np.repeat(pixel, 3), mesh.faces[face].ravel())), shape=shape)

@@ -11,7 +11,8 @@ import trimesh
 from pipeline.calibrate.camera import PinholeCamera
 from pipeline.reconstruct.distances import hat_points, spot_pairs, vertex_pairs
 from pipeline.reconstruct.harmonics import harmonics
-from pipeline.reconstruct.mesh import first_hit, stiffness, vertex_areas
+from pipeline.reconstruct.mesh import first_hit, interpolated_normals, stiffness, vertex_areas
+from pipeline.reconstruct.seen import see, window
 from pipeline.reconstruct.spots import Spots
 from pipeline.reconstruct.views import bilinear_reading, footprint_reading, image_points, see_surface
 from pipeline.rig import CameraConfig
@@ -217,3 +218,43 @@ def test_surface_seen_at_a_grazing_angle_is_not_read(limit: float) -> None:
         assert (share[angle < limit - hat - 4.0] > 0.5).all()
     cosine = see_surface(ball, camera, limit).cosine
     assert np.cos(np.deg2rad(limit)) < cosine.min() < np.cos(np.deg2rad(limit - 4.0))
+
+
+@pytest.mark.parametrize("aside_px", [0.0, 25.0])
+def test_every_ray_that_meets_the_surface_is_seen_once(aside_px: float) -> None:
+    """Rationale: rays are cast in bands and only where the mesh can be, numbered by hand. Against all rays at once.
+
+    Expected behaviour: the same pixels, triangles and places, also where the picture cuts the object off.
+    """
+    scan = trimesh.creation.icosphere(subdivisions=3, radius=15.0)
+    camera = wide_camera((0.0, -200.0, 0.0), 38.0)
+    camera = replace(camera, centre=camera.centre + aside_px)
+    origins, directions = camera.rays(camera.pixel_centres(3))
+    hit = first_hit(scan, origins, directions)
+    rows, columns = np.divmod(np.flatnonzero(hit.triangle >= 0), 3 * camera.width)
+    order = np.flatnonzero(hit.triangle >= 0)
+    bands = list(see(scan, camera, 3))
+    assert len(bands) > 1
+    np.testing.assert_array_equal(np.concatenate([b.pixel for b in bands]), rows // 3 * camera.width + columns // 3)
+    np.testing.assert_array_equal(np.concatenate([b.triangle for b in bands]), hit.triangle[order])
+    np.testing.assert_allclose(np.concatenate([b.distance for b in bands]), hit.distance[order])
+    normals = interpolated_normals(scan, hit.triangle[order], hit.barycentric[order])
+    cosine = -(normals * directions[order]).sum(axis=1)
+    np.testing.assert_allclose(np.concatenate([b.cosine for b in bands]), cosine, atol=1e-12)
+
+
+def test_the_window_is_all_of_the_image_where_that_is_not_certain() -> None:
+    """Expected behaviour: two pixels around the outline; all of it for a mesh that reaches behind the camera; not empty
+    for one beside the picture.
+    """
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=15.0)
+    camera = wide_camera((0.0, -200.0, 0.0), 38.0)
+    corner = camera.project(ball.vertices)[0]
+    rows, columns = window(ball, camera)
+    assert 2 <= corner[:, 0].min() - columns.start < 3
+    assert 2 <= rows.stop - corner[:, 1].max() < 3
+    every = slice(0, camera.height), slice(0, camera.width)
+    assert window(ball.copy().apply_scale(20.0), camera) == every
+    rows, columns = window(ball, replace(camera, centre=camera.centre + 1e4))
+    assert rows.stop > rows.start
+    assert columns.stop > columns.start
