@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from disco_twin.firmware.wire import Timed
+from disco_twin.firmware.wire import Commands, Timed
 from hw.devices.omicron_protocol import LEVELS, USB_BAUD, Mode, Status
 
 LATENCY_S = 0.015
@@ -116,27 +116,23 @@ class OmicronFirmware:
 
     def __init__(self, head: LaserHead, baud: int = USB_BAUD) -> None:
         self.head, self.baud = head, baud
-        self._line = bytearray()
+        self._commands = Commands(b"\r")
         self._separator = "\xa7"
 
     def opened(self, now: float) -> None:
         """Opening the port changes nothing: a laser that emits goes on."""
-        self._line.clear()
+        self._commands.clear()
 
     def power_cycle(self, now: float) -> None:
         """Settings from memory; the separator is the factory's again."""
-        self._line.clear()
+        self._commands.clear()
         self._separator = "\xa7"
         self.head.start(now)
 
     def feed(self, data: bytes, now: float) -> list[Timed]:
         """Answer every command that ends in these bytes."""
         answers: list[Timed] = []
-        for byte in data:
-            if byte != 0x0D:
-                self._line.append(byte)
-                continue
-            line, self._line = self._line.decode("latin-1"), bytearray()
+        for line in self._commands.complete(data):
             if line.startswith("?") and now >= self.head.restarted_until:
                 answers += self._answer(line[1:4], line[4:], now)
         return answers

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from disco_twin.firmware.wire import Timed
+from disco_twin.firmware.wire import Commands, Timed
 
 BAUD = 9600
 LATENCY_S = 0.02
@@ -17,24 +17,20 @@ class OphirFirmware:
 
     def __init__(self, watts: Callable[[], float], range_w: float = 0.03, model: str = "Vega") -> None:
         self.watts, self.range_w, self.model = watts, range_w, model
-        self._line = bytearray()
+        self._commands = Commands(b"\r\n")
 
     def opened(self, now: float) -> None:
         """Opening the port changes nothing."""
-        self._line.clear()
+        self._commands.clear()
 
     def power_cycle(self, now: float) -> None:
         """The meter starts as it was."""
-        self._line.clear()
+        self._commands.clear()
 
     def feed(self, data: bytes, now: float) -> list[Timed]:
         """Answer every command that ends in these bytes."""
         answers: list[Timed] = []
-        for byte in data:
-            if byte not in b"\r\n":
-                self._line.append(byte)
-                continue
-            line, self._line = self._line.decode("latin-1"), bytearray()
+        for line in self._commands.complete(data):
             if line.startswith("$"):
                 answers.append((LATENCY_S, f"{self._answer(line[1:])}\r\n".encode("ascii")))
         return answers

@@ -9,7 +9,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 from hw.clock import Clock
@@ -34,6 +34,26 @@ class Firmware(Protocol):
 
     def power_cycle(self, now: float) -> None:
         """The mains failed and came back."""
+
+
+class Commands:
+    """Commands out of the bytes that arrive, for devices whose commands end in a byte of `ends`."""
+
+    def __init__(self, ends: bytes) -> None:
+        self._ends, self._begun = ends, bytearray()
+
+    def clear(self) -> None:
+        """Forget a command that has begun."""
+        self._begun.clear()
+
+    def complete(self, data: bytes) -> Iterator[str]:
+        """Every command that ends in these bytes, without its end."""
+        for byte in data:
+            if byte not in self._ends:
+                self._begun.append(byte)
+                continue
+            command, self._begun = self._begun.decode("latin-1"), bytearray()
+            yield command
 
 
 # ---- what may become of an answer

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from disco_twin.firmware.turning import Spindle
-from disco_twin.firmware.wire import Timed
+from disco_twin.firmware.wire import Commands, Timed
 from hw.devices.zaber import BAUD, checksum
 
 LATENCY_S = 0.002
@@ -48,26 +48,22 @@ class ZaberFirmware:
             "maxspeed": "153600",
         }
         self._volatile = dict(self.settings)
-        self._line = bytearray()
+        self._commands = Commands(b"\r\n")
 
     def opened(self, now: float) -> None:
         """Opening the port changes nothing."""
-        self._line.clear()
+        self._commands.clear()
 
     def power_cycle(self, now: float) -> None:
         """The reference is lost, settings of the session are the stored ones again."""
-        self._line.clear()
+        self._commands.clear()
         self.settings = dict(self._volatile)
         self.spindle.power_cycle(now)
 
     def feed(self, data: bytes, now: float) -> list[Timed]:
         """Answer every command that ends in these bytes."""
         answers: list[Timed] = []
-        for byte in data:
-            if byte not in b"\r\n":
-                self._line.append(byte)
-                continue
-            line, self._line = self._line.decode("latin-1"), bytearray()
+        for line in self._commands.complete(data):
             answer = self._answer(line, now)
             if answer:
                 answers.append((LATENCY_S, answer))
