@@ -174,18 +174,27 @@ def wiring_of(laser: LaserDevice) -> LaserWiring:
     )
 
 
-def open_camera(device: GenicamDevice, sensor: SensorDevice, shape: tuple[int, int]) -> GenicamCamera:
-    """A GenICam camera that makes the bracket's exposures. shape: (height, width)."""
-    from hw.devices.genicam import GenicamCamera
+def open_camera(file: DevicesFile, device: GenicamDevice, shape: tuple[int, int]) -> GenicamCamera:
+    """A GenICam camera of the rig file that makes the bracket's exposures. shape: (height, width)."""
+    from hw.devices.genicam import CameraError, GenicamCamera
     from hw.devices.viva import VivaGrabber
 
-    grabber = VivaGrabber(device.address, device.pixel_format, shape, serial=device.serial)
-    camera = GenicamCamera(device.name, grabber, sensor.bracket(), shape)
+    assert file.sensor is not None  # the rig file's own check
+    table = f"cameras[{file.cameras.index(device)}]"
     try:
-        camera.check()
-    except BaseException:
-        camera.close()
-        raise
+        grabber = VivaGrabber(device.address, device.pixel_format, shape, serial=device.serial)
+        camera = GenicamCamera(device.name, grabber, file.sensor.bracket(), shape)
+        try:
+            camera.check()
+        except BaseException:
+            camera.close()
+            raise
+    except CameraError as error:
+        raise CameraError(f"{file.path}: {table}.address = {device.address!r}: {error}") from error
+    except InputError as error:
+        key = error.key if error.key is None or "." in error.key else f"{table}.{error.key}"
+        raise InputError(error.problem, file=file.path, key=key, value=error.value, allowed=error.allowed,
+                         remedy=error.remedy) from error  # fmt: skip
     return camera
 
 
@@ -223,7 +232,7 @@ def assembled(
         else:
             for device, nominal in zip(file.cameras, scene.cameras, strict=True):
                 assert isinstance(device, GenicamDevice) and file.sensor is not None  # the rig file's own check
-                camera = open_camera(device, file.sensor, (nominal.height, nominal.width))
+                camera = open_camera(file, device, (nominal.height, nominal.width))
                 opened.callback(camera.close)
                 black.append(partial(require_black, camera, file.sensor))
                 cameras.append(camera)

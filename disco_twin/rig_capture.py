@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 from disco_twin.assembly import assembled
 from disco_twin.folder import content_key, require_folder, write_atomically
 from disco_twin.rig_file import EMULATED, DevicesFile
-from disco_twin.rig_rules import load_rig_file, require_same, require_scene
-from hw.errors import InputError
+from disco_twin.rig_rules import load_rig_file, require_reach, require_same, require_scene
+from hw.errors import InputError, naming
 from pipeline.capture.files import IMAGES
 from pipeline.capture.loop import capture
 from pipeline.capture.stream import StreamReader
@@ -35,12 +35,23 @@ def open_rig_file(run: Run, path: Path, armed: bool) -> DevicesFile:
             file=path,
             remedy="see to interlock, door and goggles, then repeat the command with --arm",
         )
+    require_reach(file, run.world.plan, path)
     folder = run.folder
     if (folder.capture / IMAGES).exists() and not folder.taken_by_devices:
         raise InputError("this folder holds a simulated capture", file=folder.root, remedy="choose another --out")
     if _has_images(folder.capture):
-        require_same(file, load_rig_file(folder.devices_record), path)
+        require_same(file, _begun_with(folder.devices_record), path)
     return file
+
+
+def _begun_with(record: Path) -> DevicesFile:
+    """The rig file that a capture keeps."""
+    try:
+        return load_rig_file(record)
+    except InputError as error:
+        remedy = "put the rig file there that the capture was begun with, or choose another --out"
+        problem = f"the capture's own copy of its rig file cannot be used ({error.problem})"
+        raise InputError(problem, file=record, key=error.key, value=error.value, remedy=remedy) from error
 
 
 def _has_images(folder: Path) -> bool:
@@ -67,7 +78,7 @@ def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool
     run.stage("scan", scan_key, lambda _: simulate.write_scan(world, folder.capture, real))
 
     def take_images(report: Report) -> None:
-        with assembled(file, run.scene.rig, _twin(run, file), logs, armed=armed) as rig:
+        with naming(path), assembled(file, run.scene.rig, _twin(run, file), logs, armed=armed) as rig:
             capture(rig, world.plan, folder.capture, report, sensor)
 
     run.stage("capture", key, take_images, "images")

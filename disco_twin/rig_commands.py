@@ -167,7 +167,7 @@ def _metered(connect: Connector) -> float:
 
 def _camera_says(file: DevicesFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
     assert file.sensor is not None
-    with _using(open_camera(device, file.sensor, shape)) as camera:
+    with _using(open_camera(file, device, shape)) as camera:
         return camera.grabber.identity()
 
 
@@ -231,7 +231,7 @@ def _test_table(connect: Connector) -> str:
 
 def _test_camera(file: DevicesFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
     assert file.sensor is not None
-    with _using(open_camera(device, file.sensor, shape)) as camera:
+    with _using(open_camera(file, device, shape)) as camera:
         black = require_black(camera, file.sensor)
         for _ in range(FRAMES):
             camera.expose()

@@ -88,7 +88,7 @@ class ZaberDevice(Turning):
     """A Zaber rotary stage, ASCII protocol."""
 
     kind: Literal["zaber"]
-    microsteps_per_deg: Annotated[float, Field(gt=0, le=1e6)]
+    microsteps_per_deg: Annotated[float, Field(ge=1, le=1e6)]
     device: Annotated[int, Field(ge=1, le=99)] = 1
     axis: Annotated[int, Field(ge=1, le=9)] = 1
 
@@ -122,7 +122,7 @@ class SimulatedCamera(Strict):
 class SensorDevice(Strict):
     """The sensor that all GenICam cameras share. Its exposures: longest_exposure_s * 2^-k, k in `exponents`."""
 
-    longest_exposure_s: Annotated[float, Field(gt=0, le=10)]
+    longest_exposure_s: Annotated[float, Field(ge=1e-6, le=10)]
     exponents: Annotated[tuple[Annotated[int, Field(ge=0, le=23)], ...], Field(min_length=1)] = tuple(range(12))
     bits: Annotated[int, Field(ge=8, le=16)] = 12
     saturation_dn: Annotated[int, Field(ge=1, le=65535)]  # linear below this

@@ -12,6 +12,7 @@ from disco_twin.rig_file import EMULATED, PROJECTOR_STEPS, DevicesFile, GenicamD
 from hw.devices.mm_ard import ADC_TOP, LINES, PINS
 from hw.errors import InputError, naming
 from hw.rig import DARK_COUNTS
+from pipeline.capture.plan import Plan
 from pipeline.rig import RigConfig
 
 WAVELENGTH_TOLERANCE_NM = 10.0
@@ -101,6 +102,11 @@ def _require_ranges(rig: DevicesFile) -> None:
             key, remedy = f"lasers[{i}].photodiode_limits", "they are shares of power_mw, as in [0.5, 1.5]"
             raise InputError("do not enclose 1", key=key, value=laser.photodiode_limits, allowed="lower < 1 < upper",
                              remedy=remedy)  # fmt: skip
+        if low_share <= DARK_COUNTS / ADC_TOP:
+            remedy = f"raise the lower one: up to {DARK_COUNTS} of the converter's {ADC_TOP} counts are darkness"
+            raise InputError("tell no light from darkness", key=f"lasers[{i}].photodiode_limits",
+                             value=laser.photodiode_limits, allowed=f"lower > {DARK_COUNTS / ADC_TOP:.2g}",
+                             remedy=remedy)  # fmt: skip
         _require_counts(i, laser)
 
 
@@ -136,8 +142,14 @@ def _require_cameras(rig: DevicesFile) -> None:
         raise InputError(
             "required table is missing", key="sensor", remedy="GenICam cameras need [sensor]: see docs/lab.md"
         )
-    if rig.sensor is not None:
-        _require_sensor(rig.sensor, len(rig.lasers))
+    if rig.sensor is None:
+        return
+    _require_sensor(rig.sensor, len(rig.lasers))
+    for i, camera in enumerate(rig.cameras):
+        if isinstance(camera, GenicamDevice) and int(camera.pixel_format[4:6]) < rig.sensor.bits:
+            raise InputError("has fewer bits than sensor.bits", key=f"cameras[{i}].pixel_format",
+                             value=camera.pixel_format, allowed=f"Mono{rig.sensor.bits} or deeper",
+                             remedy="name a deeper format, or lower sensor.bits")  # fmt: skip
 
 
 def _require_sensor(sensor: SensorDevice, lasers: int) -> None:
@@ -179,6 +191,22 @@ def require_scene(rig: DevicesFile, scene: RigConfig, path: Path) -> None:
     if scene.projector.steps != PROJECTOR_STEPS:
         raise wrong("the board's mirrors have other steps than rig.projector.steps of the scene", "board",
                     PROJECTOR_STEPS, scene.projector.steps)  # fmt: skip
+
+
+def require_reach(rig: DevicesFile, plan: Plan, path: Path) -> None:
+    """Refuse mirror limits that the plan's spots leave, before hours of images and not at the first such spot."""
+    for name, limits in (("u", rig.board.limits_u), ("v", rig.board.limits_v)):
+        steps = [getattr(aim, name) for aim in plan.spots]
+        if steps and not limits[0] <= min(steps) <= max(steps) <= limits[1]:
+            outside = sum(not limits[0] <= step <= limits[1] for step in steps)
+            raise InputError(
+                f"{outside} of the scene's {len(steps)} spots lie outside",
+                file=path,
+                key=f"board.limits_{name}",
+                value=limits,
+                allowed=f"at most {min(steps)} and at least {max(steps)}",
+                remedy="widen the limits if the beam is safe there, or correct rig.projector in the scene",
+            )
 
 
 # ---- against the capture that is to be continued

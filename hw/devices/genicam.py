@@ -107,7 +107,7 @@ class GenicamCamera:
         if not abs(made - wanted) <= TOLERANCE * wanted:
             raise InputError(
                 f"camera {self.name} exposes for {made * 1e6:.2f} us instead of {wanted * 1e6:.2f} us",
-                key="longest_exposure_s",
+                key="sensor.longest_exposure_s",
                 value=self.bracket.longest_exposure_s,
                 remedy="make the shortest exposure a multiple of the camera's step, or use fewer exponents",
             )

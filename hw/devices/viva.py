@@ -99,7 +99,9 @@ class VivaGrabber:
     def _refuse_other(self, serial: str | None) -> None:
         found = self._camera.get("DeviceSerialNumber") if self._has("DeviceSerialNumber") else None
         if serial is not None and found != serial:
-            raise InputError(f"the camera at {self._address} is another one", key="serial", value=serial, allowed=found)
+            remedy = "correct its address, or its serial if it was exchanged"
+            raise InputError(f"the camera at {self._address} is another one", key="serial", value=serial, allowed=found,
+                             remedy=remedy)  # fmt: skip
 
     def _has(self, name: str) -> bool:
         return self._camera.node_info(name) is not None
@@ -130,7 +132,11 @@ class VivaGrabber:
             self._camera.set_enum("PixelFormat", wanted)
         elif not any(entry.startswith(("Mono10", "Mono12", "Mono14", "Mono16")) for entry in entries):
             raise InputError(
-                "the camera has no deep Mono format", key="pixel_format", value=wanted, allowed=str(entries)
+                "the camera has no deep Mono format",
+                key="pixel_format",
+                value=wanted,
+                allowed=", ".join(entries),
+                remedy="take a camera that sends more than 8 bits",
             )
         # Some cameras send a format that their own XML leaves out: the frames say what they are, and `grab` checks it.
         self._format = wanted
@@ -154,7 +160,10 @@ class VivaGrabber:
             limits = self._camera.feature_state("ExposureTime").range
             allowed = None if limits is None else f"{limits.min:g} to {limits.max:g} us"
             raise InputError(
-                f"camera {self._address} refuses an exposure of {seconds * 1e6:g} us ({error})", allowed=allowed
+                f"camera {self._address} refuses an exposure of {seconds * 1e6:g} us ({error})",
+                key="sensor.longest_exposure_s",
+                allowed=allowed,
+                remedy="correct sensor.longest_exposure_s and sensor.exponents",
             ) from error
         except self._vg.GenicamError as error:
             raise CameraError(f"camera {self._address}: {error}") from error
@@ -169,14 +178,20 @@ class VivaGrabber:
             if frame.pixel_format != self._format:
                 sent = frame.pixel_format
                 raise InputError(
-                    "the camera sends another format", key="pixel_format", value=self._format, allowed=sent
+                    "the camera sends another format",
+                    key="pixel_format",
+                    value=self._format,
+                    allowed=sent,
+                    remedy="name the format that it sends",
                 )
             exposure = float(self._camera.chunk_features(frame)["ChunkExposureTime"]) * 1e-6 if self._chunks else None
             pixels = np.asarray(frame.to_numpy(), np.uint16)
         except self._vg.GenicamError as error:
             raise CameraError(f"camera {self._address}: {error}. Remedy: check its cable and power") from error
         if frame.ts_dev is None:
-            raise CameraError(f"camera {self._address} sends no timestamps")
+            raise CameraError(
+                f"camera {self._address} sends no timestamps. Remedy: take one that does, or newer firmware"
+            )
         return Frame(pixels, frame.ts_dev * self._tick_s, exposure)
 
     def _next(self, timeout_s: float) -> Any:

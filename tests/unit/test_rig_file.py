@@ -130,6 +130,13 @@ responsivity = [1e12, 1e12, 1e12]
             "all genicam",
         ),
         (('name = "back"', 'name = "front"'), "cameras[1].name", "'front'", "the scene's cameras"),
+        (("[0.1, 1.5]", "[0.007, 1.5]"), "lasers[0].photodiode_limits", "[0.007, 1.5]", "lower > 0.0078"),
+        (
+            ('"10.0.0.9"', '"10.0.0.9"\npixel_format = "Mono10"'),
+            "cameras[0].pixel_format",
+            "'Mono10'",
+            "Mono12 or deeper",
+        ),
         (("10.0.0.8", "10.0.0.9"), "cameras[1].address", "'10.0.0.9'", "one camera an address"),
         (("1e12, 1e12, 1e12", "1e12, 1e12"), "sensor.responsivity", "[1000000000000.0, 1000000000000.0]", "3 values"),
         (("[0, 2, 4]", "[0, 4, 2]"), "sensor.exponents", "[0, 4, 2]", "ascending from 0"),

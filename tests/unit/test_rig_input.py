@@ -10,13 +10,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from test_capture_twin import RIG
+from test_capture_twin import RIG, Glow
 from test_rig_cli import SCENE
 from test_rig_file import CAMERAS
 
 from disco_twin.cli import main
+from disco_twin.rig import TwinRig
 from disco_twin.rig_commands import probe, rig_file_of, selftest, served
 from disco_twin.rig_rules import load_rig_file
+from hw.devices.genicam import CameraError
 from hw.errors import InputError
 from pipeline.rig import RigConfig
 
@@ -291,6 +293,78 @@ def test_other_ports_than_paths_and_sockets_are_refused(tmp_path: Path, says: Sa
     assert says("rig", "probe", path).startswith(
         f"{path}: turntable.port = '{port}': is no port (allowed: a path, or socket://HOST:PORT). Remedy: name"
     )
+
+
+# ---- cameras
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (
+            CameraError("camera 10.0.0.8 does not answer. Remedy: check power"),
+            "address = '10.0.0.8': camera 10.0.0.8 does",
+        ),
+        (
+            InputError("is another one", key="serial", value="A", allowed="B", remedy="correct it"),
+            "serial = 'A': is ano",
+        ),
+    ],
+)
+def test_a_camera_that_cannot_be_opened_names_its_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, said: str
+) -> None:
+    def grabber(address: str, *_: object, **__: object) -> None:
+        if address == "10.0.0.8":
+            raise error
+        raise InputError("the camera needs the package viva-genicam", remedy="pip install 'disco-twin[genicam]'")
+
+    monkeypatch.setattr("hw.devices.viva.VivaGrabber", grabber)
+    path = rig_file(tmp_path, cameras=CAMERAS)
+    first, second = probe(load_rig_file(path), RIG)
+    assert first.text.startswith(f"{path}: the camera needs the package") and "Remedy: pip" in first.text
+    assert second.text.startswith(f"{path}: cameras[1].{said}") and "Remedy: " in second.text
+
+
+# ---- a capture
+
+
+def test_a_capture_names_the_rig_file_s_keys_and_its_own_copy(
+    tmp_path: Path, says: Says, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A port that is not there, mirror limits that the plan leaves, a damaged copy: none is the scene's fault.
+
+    Expected: before the first image; after each the capture goes on once the file is right.
+    """
+    scene, rig, out = tmp_path / "scene.toml", tmp_path / "rig.toml", tmp_path / "out"
+    scene.write_text(SCENE)
+    good = rig_file_of(RigConfig(cameras=(RIG.cameras[0],)), {})
+    monkeypatch.setattr("disco_twin.simulate.twin_rig", lambda world, folder: TwinRig(world.scene.rig, Glow(), 5))
+    command = ("capture", scene, "--out", out, "--rig", rig)
+    rig.write_text(good.replace('kind = "mm-ard"\nport = "emulated"', 'kind = "mm-ard"\nport = "/dev/none"'))
+    assert says(*command).startswith(
+        f"{rig}: board.port = '/dev/none': the port of mirror board cannot be opened: there"
+    )
+    rig.write_text(good.replace("floodlight_line", "limits_u = [2040, 2060]\nfloodlight_line"))
+    said = says(*command)
+    assert re.match(
+        rf"{rig}: board.limits_u = \[2040, 2060\]: \d of the scene's 6 spots lie outside \(allowed: at", said
+    )
+    rig.write_text(good)
+    with pytest.raises(SystemExit) as end:
+        main([str(word) for word in command])
+    assert end.value.code == 0
+    record = out / "capture" / "devices.toml"
+    kept = record.read_bytes()
+    for damaged in (b"", b"format_version = 9\n", kept[: len(kept) // 2]):
+        record.write_bytes(damaged)
+        said = says(*command)
+        assert said.startswith(f"{record}: ") and "the capture's own copy of its rig file cannot be used" in said
+        assert "Remedy: put the rig file there that the capture was begun with, or choose another --out" in said
+    record.write_bytes(kept)
+    with pytest.raises(SystemExit) as end:
+        main([str(word) for word in command])
+    assert end.value.code == 0
 
 
 # ---- the options
