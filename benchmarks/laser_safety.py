@@ -31,8 +31,9 @@ import hw.devices.mm_ard as board_driver
 from disco_twin.assembly import Connector, free_line, wiring_of
 from disco_twin.firmware.emulate import Emulation
 from disco_twin.firmware.serve import Server
-from disco_twin.rig_commands import emulated_devices, rig_file_of
+from disco_twin.rig_commands import rig_file_of
 from disco_twin.rig_rules import load_rig_file
+from disco_twin.rig_served import emulated_devices
 from hw.clock import WallClock
 from hw.devices.omicron_protocol import Mode
 from hw.interface import Aim

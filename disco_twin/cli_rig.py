@@ -58,7 +58,7 @@ def emulate(
     seconds: Annotated[float, typer.Option(help="How long.")] = 3600.0,
 ) -> None:
     """Serve the devices of a scene on pseudo-terminals, in real time, and write the rig file that reaches them."""
-    from disco_twin.rig_commands import served
+    from disco_twin.rig_served import served
     from disco_twin.scene import load_scene
 
     if not 0.1 <= seconds <= LONGEST_S:

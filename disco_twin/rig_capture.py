@@ -87,7 +87,7 @@ def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool
 def _twin(run: Run, file: DevicesFile) -> TwinRig | None:
     """What simulated cameras look at; emulated devices without one need no light."""
     from disco_twin.rig import TwinRig
-    from disco_twin.rig_commands import Darkness
+    from disco_twin.rig_served import Darkness
 
     if file.simulated_cameras:
         from disco_twin.simulate import twin_rig

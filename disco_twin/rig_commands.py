@@ -1,37 +1,30 @@
-"""`disco-twin rig probe | selftest | emulate`: what is on the ports, does it work, and devices to try it all with."""
+"""`disco-twin rig probe | selftest`: what is on the ports, and does it work."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from disco_twin.assembly import Connector, free_line, open_camera, require_black
-from disco_twin.folder import require_folder, write_atomically
+from disco_twin.folder import require_folder
 from disco_twin.rig_file import EMULATED, DevicesFile, GenicamDevice, LaserDevice
 from hw.clock import Clock, WallClock
 from hw.devices.mm_ard import ADC_TOP
 from hw.devices.omicron import OmicronLaser
 from hw.errors import DeviceFault, DiscoError, InputError
-from hw.interface import Aim
 from hw.rig import DARK_COUNTS, cut_light
 from hw.trusted_board import TrustedBoard
 from hw.wiring import Board
 from pipeline.rig import RigConfig
 
-if TYPE_CHECKING:
-    from disco_twin.firmware.emulate import Emulation
-
 log = logging.getLogger(__name__)
-
-F32 = NDArray[np.float32]
 
 TEST_ANGLE_DEG = 30.0
 ANGLE_TOLERANCE_DEG = 0.05
@@ -329,59 +322,7 @@ def _through_gate(board: TrustedBoard, wiring: LaserDevice, name: str, own_mw: f
     return seen
 
 
-# ---- emulated devices for another program
-
-
-class Darkness:
-    """A response source for devices without a camera."""
-
-    def prepare(self, aims: Sequence[Aim]) -> None:
-        """Nothing to do."""
-
-    def image(self, camera: int, aim: Aim, laser: int) -> F32:
-        """Nobody looks."""
-        raise DiscoError("these emulated devices have no camera")
-
-    def silhouette(self, camera: int, angle: int) -> F32:
-        """Nobody looks."""
-        raise DiscoError("these emulated devices have no camera")
-
-
-def emulated_devices(scene: RigConfig, seed: int) -> Emulation:
-    """The devices of a scene in real time, for cameras elsewhere: the photodiode reads what falls on it now."""
-    from disco_twin.firmware.emulate import Emulation
-    from disco_twin.rig import TwinRig, watts_per_count
-
-    emulation = Emulation(TwinRig(scene, Darkness(), seed), WallClock())
-    bench = emulation.bench
-
-    def live(pin: int) -> int:
-        if bench.light() != [pin]:
-            return 0
-        watts = bench.heads[pin].emission(bench.clock.now()) * bench.heads[pin].max_power_mw * 1e-3
-        return round(watts / watts_per_count(scene.lasers[pin]))
-
-    bench.board.sample = live
-    return emulation
-
-
-@contextmanager
-def served(scene: RigConfig, seed: int, folder: Path) -> Iterator[Path]:
-    """Emulated devices on pseudo-terminals in a folder, and the rig file that reaches them."""
-    from disco_twin.firmware.serve import Server
-
-    require_folder(folder, "--ports")
-    lines, path = emulated_devices(scene, seed).lines, folder / "rig.toml"
-    remedy = "choose another --ports, or take it away"
-    for port in (folder / name for name in lines):
-        if port.exists() and not port.is_symlink():
-            raise InputError("is in the place of an emulated device's port", file=port, remedy=remedy)
-    content = rig_file_of(scene, {name: str((folder / name).absolute()) for name in lines}).encode()
-    if path.exists() and path.read_bytes() != content:
-        raise InputError("is another rig file than the one to be written", file=path, remedy=remedy)
-    with Server(lines, folder):
-        write_atomically(path, content)
-        yield path
+# ---- the rig file of emulated devices
 
 
 def rig_file_of(scene: RigConfig, ports: dict[str, str]) -> str:

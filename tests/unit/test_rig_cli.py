@@ -11,8 +11,9 @@ from disco_twin.cli import main
 from disco_twin.firmware.emulate import Emulation
 from disco_twin.firmware.omicron import COMMANDS, Command, LaserHead
 from disco_twin.rig import TwinRig
-from disco_twin.rig_commands import emulated_devices, probe, rig_file_of, selftest, served
+from disco_twin.rig_commands import probe, rig_file_of, selftest
 from disco_twin.rig_rules import load_rig_file
+from disco_twin.rig_served import emulated_devices, served
 from hw.devices.omicron_protocol import Mode
 from hw.errors import SwitchedOff
 from pipeline.capture.lasers import read_lasers
@@ -70,7 +71,7 @@ def test_probe_and_selftest_of_served_devices(
     monkeypatch.setattr("disco_twin.firmware.turning.SPEED_DEG_S", 720.0)
     monkeypatch.setattr("hw.devices.mm_ard.BOOT_S", 0.05)
     devices = [emulated_devices(RIG, 3)]
-    monkeypatch.setattr("disco_twin.rig_commands.emulated_devices", lambda scene, seed: devices[0])
+    monkeypatch.setattr("disco_twin.rig_served.emulated_devices", lambda scene, seed: devices[0])
     with served(RIG, 3, tmp_path / "ports") as path:
         with pytest.raises(SystemExit) as end:
             main(["rig", "probe", str(path), "--logs", str(tmp_path / "logs")])
@@ -144,7 +145,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> Emulation:
     monkeypatch.setattr("disco_twin.firmware.turning.SPEED_DEG_S", 720.0)
     monkeypatch.setattr("hw.devices.mm_ard.BOOT_S", 0.05)
     devices = emulated_devices(RIG, 3)
-    monkeypatch.setattr("disco_twin.rig_commands.emulated_devices", lambda scene, seed: devices)
+    monkeypatch.setattr("disco_twin.rig_served.emulated_devices", lambda scene, seed: devices)
     return devices
 
 

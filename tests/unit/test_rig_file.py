@@ -17,9 +17,10 @@ from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.firmware.emulate import Emulation
 from disco_twin.firmware.serve import Server
 from disco_twin.rig import TwinRig
-from disco_twin.rig_commands import emulated_devices, rig_file_of
+from disco_twin.rig_commands import rig_file_of
 from disco_twin.rig_file import DevicesFile
 from disco_twin.rig_rules import load_rig_file, require_same, require_scene
+from disco_twin.rig_served import emulated_devices
 from hw.errors import DeviceFault, InputError
 from pipeline.capture.loop import Interrupted, capture
 from pipeline.capture.reference import RigMoved

@@ -11,13 +11,14 @@ from pathlib import Path
 
 import pytest
 from test_capture_twin import RIG, Glow
-from test_rig_cli import SCENE
+from test_rig_cli import SCENE, quick
 from test_rig_file import CAMERAS
 
 from disco_twin.cli import main
 from disco_twin.rig import TwinRig
-from disco_twin.rig_commands import probe, rig_file_of, selftest, served
+from disco_twin.rig_commands import probe, rig_file_of, selftest
 from disco_twin.rig_rules import load_rig_file
+from disco_twin.rig_served import served
 from hw.devices.genicam import CameraError
 from hw.errors import InputError
 from pipeline.rig import RigConfig
@@ -197,6 +198,29 @@ def test_power_in_another_unit_is_refused_by_what_the_laser_says_of_itself(
                 assert f"{path}: lasers[0].power_mw = {power}: laser 635 nm (LuxX) says that its max" in found[0].text
                 assert found[0].text.endswith(f"(allowed: more than 0.1, at most 10). Remedy: {remedy}")
                 run.close()
+
+
+def test_the_self_test_compares_photodiode_own_reading_and_meter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """watts_per_count twice what it is for the first laser. Expected: refused with the counts and the value that the
+    laser's own reading asks for; for the others the value that the power meter asks for.
+    """
+    quick(monkeypatch)
+    monkeypatch.setattr("disco_twin.rig_commands._metered", lambda connect: 0.0095)
+    with served(RIG, 3, tmp_path / "ports") as path:
+        content = path.read_text()
+        right = float(re.findall(r"watts_per_count = (\S+)", content)[0])
+        content = content.replace(f"watts_per_count = {right!r}", f"watts_per_count = {2 * right!r}", 1)
+        path.write_text(content + '[power_meter]\nkind = "ophir"\nport = "emulated"\n')
+        found = {f.name: f.text for f in selftest(load_rig_file(path), None, armed=True)}
+    first, second = found["laser 635 nm"], found["laser 532 nm"]
+    said = re.search(r"gives 20.0\d mW \((\d+) counts\).*\(allowed: 1 to 15 mW\)", first)
+    assert said and 1e-5 < right < 2.5e-5
+    assert re.search(rf"Remedy: .*is near {0.01 / int(said[1]):.3g} by the laser's own reading", first)
+    assert re.search(
+        r"photodiode 10.0\d mW \((\d+) counts\), power meter 9.50 mW: watts_per_count = 1.\d+e-05;", second
+    )
 
 
 # ---- ports
