@@ -26,7 +26,7 @@ from disco_twin.firmware.turning import Spindle
 from disco_twin.firmware.wire import Line
 from disco_twin.firmware.zaber import MICROSTEPS_PER_DEG, ZaberFirmware
 from disco_twin.rig import TwinRig
-from disco_twin.rig_commands import emulated_devices
+from disco_twin.rig_served import emulated_devices
 from hw.bytelog import ByteLog, ReplayPeer, read_log
 from hw.clock import VirtualClock
 from hw.devices.mm_ard import MirrorBoard
