@@ -144,6 +144,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> Emulation:
     monkeypatch.setattr("disco_twin.firmware.omicron.EMISSION_S", 0.05)
     monkeypatch.setattr("disco_twin.firmware.turning.SPEED_DEG_S", 720.0)
     monkeypatch.setattr("hw.devices.mm_ard.BOOT_S", 0.05)
+    monkeypatch.setattr("disco_twin.firmware.mm_ard.BOOT_S", 0.02)
     devices = emulated_devices(RIG, 3)
     monkeypatch.setattr("disco_twin.rig_served.emulated_devices", lambda scene, seed: devices)
     return devices
