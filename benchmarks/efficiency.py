@@ -1,10 +1,11 @@
 """Efficiency of the estimators of R_d and of spot images, per decade below the peak: 1 / (variance x time).
 
-R_d: columns of the true R_d of `quick` and of a ball of 60 mm with a dark vein, by the analogue walk (no windows, one
-majorant for all; Russian roulette below a tenth of the power), with local majorants where they save time, and with
-weight windows of growing effort. Images: one spot of `quick` seen by one camera at one pixel a vertex's footprint, by
-exits alone, lobe connections, lobe connections with windows, and stock `volpath` that starts at the camera and connects
-to a spot light at the boundary. The truth of each is a long run with windows (and lobe connections) of its own photons.
+On `quick` and on a ball of 60 mm with a dark vein. R_d: columns of the truth, from what leaves near each vertex, by the
+walk without windows (one majorant for all; Russian roulette below a tenth of the power), with local majorants where
+they save time, and with weight windows of growing effort. Images: one spot seen by one camera at one pixel a vertex's
+footprint, by the analogue walk (exits alone), lobe connections, lobe connections with windows, and on `quick` by stock
+`volpath`, which starts at the camera and connects to a spot light at the boundary. The truth of each is a long run with
+windows (and lobe connections) of its own photons.
 
 The variance is that of 16 replicates, relative to the truth's square, averaged over the entries of a decade; seconds
 are the processor's, all threads', since other programs share the machine. Every point of a curve is measured.
@@ -51,10 +52,11 @@ def efficiency(quick: bool) -> dict[str, Any]:
         rows = list(columns_of(obj, basis, columns, quick))
         figures["curves"] += curves(f"R_d, {name}", rows)
         figures |= gains(rows, "analogue", "" if name == "quick" else f"_{name}")
-    rows = list(images(quick))
-    figures["curves"] += curves("spot image", rows)
-    figures |= gains([r for r in rows if r.name in ("volpath", "lobes", "lobes, effort 1.25")], "volpath", "")
-    figures |= gains([r for r in rows if r.name in ("exits", "lobes", "lobes, effort 1.25")], "exits", "")
+        rows = list(images(name, obj, quick))
+        figures["curves"] += curves(f"spot image, {name}", rows)
+        figures |= gains([r for r in rows if r.name != "volpath"], "exits", "" if name == "quick" else f"_{name}")
+        if name == "quick":
+            figures |= gains([r for r in rows if r.name in ("volpath", "lobes", "lobes, effort 1.25")], "volpath", "")
     figures |= cameras(quick)
     return figures
 
@@ -220,28 +222,24 @@ def columns_of(obj: Any, basis: Any, columns: Sequence[int], quick: bool) -> Ite
         yield from measured(f"effort {effort:g}", max(20, int(1800 * scale / effort)), run(effort), truth)
 
 
-def images(quick: bool) -> Iterator[Measured]:
-    """A spot's image by every estimator."""
-    import mitsuba as mi
-
-    from benchmarks.volpath import volpath_scene
+def images(name: str, obj: Any, quick: bool) -> Iterator[Measured]:
+    """A spot's image, at one pixel a vertex's footprint, by every estimator; volpath on `quick` alone."""
     from disco_twin.light.importance import Splitting
     from disco_twin.light.sources import BeamSource
     from disco_twin.light.transport import Lobe, Transport
-    from disco_twin.object.build import Medium, TwinObject, build_object
-    from disco_twin.scene import load_scene
+    from disco_twin.object.build import Medium, TwinObject
     from pipeline.calibrate.camera import PinholeCamera, look_at
 
-    obj = build_object(load_scene(SCENE))
     medium = obj.medium
     one = Medium(medium.sigma_t[:1], medium.albedo[:1], medium.low, medium.high, medium.g[:1])
     obj = TwinObject(obj.mesh, obj.boundary, one)
+    size = float(np.abs(obj.mesh.vertices).max()) / 18.0  # of quick's stone
     pose = look_at((390.0, -120.0, 190.0), (0.0, 0.0, 0.0))
-    camera = PinholeCamera(48, 32, np.full(2, 62.0 / 0.176), np.array([24.0, 16.0]), np.zeros(5), pose)
+    camera = PinholeCamera(48, 32, np.full(2, 62.0 / 0.176 / size), np.array([24.0, 16.0]), np.zeros(5), pose)
     origin, radius = np.array([590.0, 60.0, 110.0]), 1.0
     axis = -origin / np.linalg.norm(origin)
     tags = np.tile(origin, (REPLICATES, 1)), np.tile(axis, (REPLICATES, 1))
-    entries = np.tile(-axis * 17.0, (REPLICATES, 1))
+    entries = np.tile(-axis * 17.0 * size, (REPLICATES, 1))
     transports = {"exits": Transport(obj, lobe=Lobe(100.0, 0.0, 0.0)), "lobes": Transport(obj)}
 
     def run(name: str, effort: float | None) -> Callable[[int, int], F64]:
@@ -261,10 +259,20 @@ def images(quick: bool) -> Iterator[Measured]:
     truth = run("lobes", 3.0)(1500 * scale, 9).mean(axis=0)
     yield from measured("exits", 4000 * scale, run("exits", None), truth)
     yield from measured("lobes", 2000 * scale, run("lobes", None), truth)
-    for effort in (1.25, 3.0):
+    for effort in EFFORTS[1:]:
         yield from measured(
             f"lobes, effort {effort:g}", max(20, int(1000 * scale / effort)), run("lobes", effort), truth
         )
+    if name == "quick":
+        yield from volpath_images(obj, camera, origin, radius, truth, scale)
+
+
+def volpath_images(obj: Any, camera: Any, origin: F64, radius: float, truth: F64, scale: int) -> Iterator[Measured]:
+    """The same spot by stock volpath, which starts at the camera and connects to a spot light at the boundary."""
+    import mitsuba as mi
+
+    from benchmarks.volpath import volpath_scene
+
     with tempfile.TemporaryDirectory() as folder:
         angle = float(np.degrees(np.arctan(radius / (np.linalg.norm(origin) - 17.0))))
         beam = {
