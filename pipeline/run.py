@@ -33,7 +33,8 @@ from pipeline.calibrate.calibration import Calibration, nominal_calibration
 from pipeline.calibrate.camera import PinholeCamera
 from pipeline.calibrate.figures import figures
 from pipeline.calibrate.fresnel import Boundary
-from pipeline.calibrate.measure import has_targets, measure
+from pipeline.calibrate.measure import measure
+from pipeline.calibrate.target_images import has_targets
 from pipeline.capture.stream import StreamReader
 from pipeline.capture.targets import FOLDER
 from pipeline.config import Strict, read_json

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from pipeline.calibrate.measure import CameraImages, Measured
+    from pipeline.calibrate.measure import Measured
     from pipeline.calibrate.pose import PoseFit
     from pipeline.calibrate.projector_fit import ProjectorFit
+    from pipeline.calibrate.target_images import CameraImages
 
 F64 = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from calibrate_twin import (
 from disco_twin.camera.lars3 import Lars3, lars3_sensor
 from disco_twin.deviation import actual_rig
 from hw.errors import DiscoError
-from pipeline.calibrate import measure, photometric
+from pipeline.calibrate import photometric, target_images
 from pipeline.calibrate.camera import PinholeCamera
 from pipeline.capture.layout import ImageMeta
 from pipeline.capture.plan import ImageAddress
@@ -44,7 +44,7 @@ class Plates:
         """Largest error of the white balance, and largest scatter about the photodiode, as shares."""
         with StreamReader(self.folder) as stream:
             sensor = lars3_sensor(self.rig)
-            found = measure._plates(stream, self.targets, sensor, self.lens, self.poses, self.rig)[0]
+            found = target_images._plates(stream, self.targets, sensor, self.lens, self.poses, self.rig)[0]
         return float(np.abs(found.factor / self.truth - 1).max()), float(found.scatter.max())
 
 
@@ -67,17 +67,17 @@ def cosine_left_out(patch: Patch) -> None:
         slope = np.abs(np.column_stack([xy, np.ones(len(xy))]) @ plane[:3, 2])
         return np.asarray(real(camera, plane) * slope.reshape(camera.height, camera.width))
 
-    patch.setattr(measure, "pixel_areas", broken)
+    patch.setattr(target_images, "pixel_areas", broken)
 
 
 def sides_confused(patch: Patch) -> None:
-    real = measure._same_side
-    patch.setattr(measure, "_same_side", lambda *arguments: not real(*arguments))
+    real = target_images._same_side
+    patch.setattr(target_images, "_same_side", lambda *arguments: not real(*arguments))
 
 
 def lasers_swapped(patch: Patch) -> None:
     real = photometric.balance
-    patch.setattr(measure, "balance", lambda light, reading, *more: real(light, reading[::-1], *more))
+    patch.setattr(target_images, "balance", lambda light, reading, *more: real(light, reading[::-1], *more))
 
 
 def factor_upside_down(patch: Patch) -> None:
@@ -87,7 +87,7 @@ def factor_upside_down(patch: Patch) -> None:
         found = real(*arguments)  # type: ignore[arg-type]
         return replace(found, factor=1 / found.factor)
 
-    patch.setattr(measure, "balance", broken)
+    patch.setattr(target_images, "balance", broken)
 
 
 PHOTOMETRIC: dict[str, tuple[float, int, Slip]] = {
@@ -117,9 +117,9 @@ def test_vignetting_upside_down_shows() -> None:
     def off(seen: F64) -> float:
         return float(np.abs(seen / seen.max() * (true.max() / true) - 1).max())
 
-    good = off(measure.illumination(lens))
+    good = off(target_images.illumination(lens))
     assert good < 1e-3
-    require_seen(lambda: off(1.0 / measure.illumination(lens)), max(good, 1e-3), 5)
+    require_seen(lambda: off(1.0 / target_images.illumination(lens)), max(good, 1e-3), 5)
 
 
 @pytest.mark.parametrize("reading", [0.0, float("nan")])

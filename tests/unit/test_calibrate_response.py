@@ -24,8 +24,8 @@ from disco_twin.world import World
 from hw.errors import InputError
 from hw.record import RawImage, Sensor, to_radiance
 from pipeline.calibrate.calibration import nominal_calibration
-from pipeline.calibrate.measure import has_targets, measure_response
 from pipeline.calibrate.response import TABLE, Response, fit_response
+from pipeline.calibrate.target_images import has_targets, measure_response
 from pipeline.capture.layout import ImageMeta
 from pipeline.capture.loop import capture
 from pipeline.capture.plan import Plan

@@ -1,0 +1,162 @@
+"""What each camera's own images of boards and of the white plate say: its lens, its white balance, its response."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+
+from hw.errors import DiscoError, InputError
+from hw.record import RawImage, Sensor, to_radiance
+from pipeline.calibrate.camera import PinholeCamera
+from pipeline.calibrate.intrinsics import Intrinsics, board_pose, find_corners, fit_intrinsics
+from pipeline.calibrate.peaks import find_peak, seen
+from pipeline.calibrate.photometric import Balance, balance, pixel_areas
+from pipeline.calibrate.response import Response, fit_response
+from pipeline.capture.plan import ImageAddress
+from pipeline.capture.stream import CorruptImage, StreamReader
+from pipeline.capture.targets import BRACKET, FOLDER, TARGETS, Targets
+from pipeline.rig import RigConfig
+
+F64 = NDArray[np.float64]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class CameraImages:
+    """What one camera's target capture says."""
+
+    lens: PinholeCamera  # nominal place, measured lens
+    intrinsics: Intrinsics
+    balance: Balance
+    plate_points: F64  # (N, 3) mm, spots on the white plate in the camera's frame
+    plate_steps: F64  # (N, 2)
+
+
+def has_targets(capture: Path, rig: RigConfig) -> bool:
+    """Whether calibration images of every camera lie beside the capture."""
+    return all((capture / FOLDER / c.name / TARGETS).is_file() for c in rig.cameras)
+
+
+def measure_response(capture: Path, rig: RigConfig, sensor: Sensor) -> Response:
+    """From every camera's bracket of a board; the cameras are of one make and share one response."""
+    images: list[list[NDArray[np.uint16]]] = []
+    for camera in rig.cameras:
+        with StreamReader(capture / FOLDER / camera.name / BRACKET) as stream:
+            stream.require_complete()
+            images.append([intact(raw).charge for raw in stream])
+        if len(images[-1]) != len(images[0]):
+            first = rig.cameras[0].name
+            raise InputError(
+                f"the bracket has {len(images[-1])} exposures, that of camera {first} has {len(images[0])}",
+                file=capture / FOLDER / camera.name / BRACKET,
+                remedy="take the bracket of every camera with the same exposures: they share one response",
+            )
+    seconds = [sensor.longest_exposure_s * 2.0**-k for k in range(len(images[0]))]
+    together = [np.concatenate([np.ravel(i) for i in same]) for same in zip(*images, strict=True)]
+    return fit_response(together, seconds, sensor)
+
+
+def intact(raw: RawImage | CorruptImage) -> RawImage:
+    if isinstance(raw, CorruptImage):
+        raise raw
+    return raw
+
+
+def read_targets(folder: Path, rig: RigConfig, camera: int, sensor: Sensor) -> CameraImages:
+    """Lens and white balance of one camera."""
+    try:
+        targets = TypeAdapter(Targets).validate_json((folder / TARGETS).read_bytes())
+    except ValueError as error:
+        raise InputError("cannot be read", file=folder / TARGETS, remedy="take the calibration images again") from error
+    nominal, board = PinholeCamera.from_config(rig.cameras[camera]), targets.corners()
+    with StreamReader(folder) as stream:
+        stream.require_complete()
+        corners: dict[int, F64 | None] = {}
+        for i, place in enumerate(targets.placements):
+            if place.kind == "board":
+                raw = intact(stream.read(ImageAddress(i, "silhouette")))
+                corners[i] = find_corners(to_radiance(raw, sensor, 0).radiance, board)
+        found = fit_intrinsics(list(corners.values()), board, nominal)
+        lens = found.lens(nominal)
+        mounts = {targets.placements[i].mount: c for i, c in corners.items() if c is not None}
+        poses = {
+            i: board_pose(mounts[p.mount], board, lens)
+            for i, p in enumerate(targets.placements)
+            if p.kind == "white" and p.mount in mounts
+        }
+        if not poses:
+            raise DiscoError(
+                f"{folder}: no white plate's place is known. Remedy: photograph the board in the same mount"
+            )
+        white, points, steps = _plates(stream, targets, sensor, lens, poses, rig)
+    return CameraImages(lens, found, white, points, steps)
+
+
+def _plates(
+    stream: StreamReader, targets: Targets, sensor: Sensor, lens: PinholeCamera, poses: dict[int, F64], rig: RigConfig
+) -> tuple[Balance, F64, F64]:
+    """Balance, and the spots' (N, 3) places in the camera's frame with their (N, 2) steps."""
+    plan, lasers = stream.plan, stream.plan.lasers
+    gain = 1.0 / illumination(lens)
+    light: list[list[float]] = []
+    reading: list[list[float]] = []
+    place, points, steps = [], [], []
+    dark = 0
+    beam_px = rig.projector.beam_diameter_mm * float(lens.focal.mean()) / next(iter(poses.values()))[2, 3]
+    config = rig.cameras[[c.name for c in rig.cameras].index(targets.camera)]
+    for i, pose in poses.items():
+        area, lit = pixel_areas(lens, pose), _same_side(config, rig, np.array(targets.placements[i].pose))
+        share = np.array(targets.reflected if lit else targets.transmitted)
+        for spot in plan.spots_at(i):
+            sums, watts, peaks = [], [], []
+            for laser in range(lasers):
+                address = ImageAddress(i, "spot", spot, laser)
+                image = to_radiance(intact(stream.read(address)), sensor, laser)
+                radiance = image.radiance * gain
+                sums.append(float((radiance * area).sum(dtype=np.float64)) / share[laser])
+                watts.append(stream.meta(address).photodiode_w)
+                peaks.append(find_peak(radiance))
+            if not np.all(np.array(watts) > 0):  # a photodiode that reads nothing, or no number
+                dark += 1
+                continue
+            if any(p.at_border for p in peaks) or not seen(peaks, np.array(watts), beam_px, 0.0).any():
+                continue
+            light.append(sums)
+            reading.append(watts)
+            place.append(targets.placements[i].mount)
+            points.append(_on_plane(lens, np.mean([p.pixel for p in peaks], axis=0), pose))
+            steps.append((plan.spots[spot].u, plan.spots[spot].v))
+    if dark:
+        log.warning("%s: %d spots on the white plate are left out: the photodiode read nothing", targets.camera, dark)
+    if len(points) < 4:
+        why = f" (in {dark} of them the photodiode read nothing)" if dark else ""
+        remedy = "check the lasers and the photodiode" if dark else "check the plate's place"
+        raise DiscoError(f"{targets.camera}: the white plate's spots are not seen{why}. Remedy: {remedy}")
+    white = balance(np.array(light).T, np.array(reading).T, np.ones(lasers), np.array(place))
+    return white, np.array(points), np.array(steps, float)
+
+
+def illumination(lens: PinholeCamera) -> F64:
+    """(H, W) cos^4 of the angle off the axis."""
+    xy = lens.undistort((lens.pixel_centres() - lens.centre) / lens.focal)
+    return np.asarray((1.0 + (xy**2).sum(axis=1)).reshape(lens.height, lens.width) ** -2)
+
+
+def _same_side(config: object, rig: RigConfig, pose: F64) -> bool:
+    """Whether the camera sees the plate's lit side (nominally)."""
+    to_camera = np.subtract(config.position_mm, pose[:3, 3])  # type: ignore[attr-defined]
+    to_laser = np.subtract(rig.projector.position_mm, pose[:3, 3])
+    return bool((to_camera @ pose[:3, 2]) * (to_laser @ pose[:3, 2]) > 0)
+
+
+def _on_plane(lens: PinholeCamera, pixel: F64, pose: F64) -> F64:
+    """(3,) where a pixel's ray meets the plane z = 0 of a (4, 4) plane -> camera; camera's frame."""
+    xy = lens.undistort(((pixel - lens.centre) / lens.focal)[None])[0]
+    ray = np.array([*xy, 1.0])
+    return np.asarray(ray * (pose[:3, 3] @ pose[:3, 2]) / (ray @ pose[:3, 2]))
