@@ -8,7 +8,9 @@ footprint, by the analogue walk (exits alone), lobe connections, lobe connection
 windows (and lobe connections) of its own photons.
 
 The variance is that of 16 replicates, relative to the truth's square, averaged over the entries of a decade; seconds
-are the processor's, all threads', since other programs share the machine. Every point of a curve is measured.
+are the processor's, all threads', since other programs share the machine. Every point of a curve is measured. The last
+point, which gains are made of, is the mean of `TURNS` runs with seeds of their own, all estimators by turns: their
+scatter is each gain's stated error, for rare bright samples make a variance that few replicates do not know.
 """
 
 from __future__ import annotations
@@ -27,36 +29,57 @@ F64 = NDArray[np.float64]
 
 REPLICATES, DECADES, LASER = 16, 5, 0
 EFFORTS = (1.1, 1.25, 3.0, 10.0, 30.0, 100.0)
-SHARES = (1 / 16, 1 / 4, 1.0)  # of the walks, the points of a curve; ratios are those of the last
+SHARES = (1 / 16, 1 / 4)  # of the walks: the points of a curve before the last
+TURNS = 6
 SCENE = Path(__file__).parents[1] / "scenes" / "quick.toml"
 
 
 @dataclass(frozen=True)
-class Measured:
-    """One setting of an estimator: processor seconds and relative variance per decade of a run of `walks` walks."""
+class Job:
+    """An estimator: `run(walks, seed)` returns (REPLICATES, columns, entries)."""
 
     name: str
     walks: int
-    seconds: float
-    variance: F64
+    run: Callable[[int, int], F64]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One setting of an estimator: seconds: (runs,) of the processor, per replicate and column; variances: (runs,
+    columns, DECADES) relative, of `walks` walks. Not known: nan.
+    """
+
+    name: str
+    walks: int
+    seconds: F64
+    variances: F64
+
+    def variance(self, known: NDArray[np.bool_]) -> F64:
+        """(runs, DECADES) over the columns where `known` (columns, DECADES)."""
+        total = np.where(known, self.variances, 0.0).sum(axis=1)
+        return np.asarray(np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan))
 
     @property
-    def efficiency(self) -> F64:
-        return np.asarray(1.0 / (self.variance * self.seconds))
+    def known(self) -> NDArray[np.bool_]:
+        """(columns, DECADES) what every run knows."""
+        return np.asarray(np.isfinite(self.variances).all(axis=0))
 
 
 def efficiency(quick: bool) -> dict[str, Any]:
     """`gain_over_analogue_by_decade`, `gain_over_volpath_by_decade`, `evenness` and `curves`."""
     figures: dict[str, Any] = {"curves": []}
     for name, obj, basis, columns in objects(quick):
-        rows = list(columns_of(obj, basis, columns, quick))
+        tail = "" if name == "quick" else f"_{name}"
+        truth, jobs = columns_of(obj, basis, columns, quick)
+        rows = compare(jobs, truth)
         figures["curves"] += curves(f"R_d, {name}", rows)
-        figures |= gains(rows, "analogue", "" if name == "quick" else f"_{name}")
-        rows = list(images(name, obj, quick))
+        figures |= gains(rows, "analogue", "effort 3", tail)
+        truth, jobs = images(name, obj, quick)
+        rows = compare(jobs, truth)
         figures["curves"] += curves(f"spot image, {name}", rows)
-        figures |= gains([r for r in rows if r.name != "volpath"], "exits", "" if name == "quick" else f"_{name}")
+        figures |= gains([r for r in rows if r.name != "volpath"], "exits", "lobes, effort 10", tail)
         if name == "quick":
-            figures |= gains([r for r in rows if r.name in ("volpath", "lobes", "lobes, effort 1.25")], "volpath", "")
+            figures |= gains(rows, "volpath", "lobes, effort 10", tail)
     figures |= cameras(quick)
     return figures
 
@@ -96,16 +119,26 @@ def cameras(quick: bool) -> dict[str, Any]:
     }
 
 
-def gains(rows: Sequence[Measured], base: str, tail: str) -> dict[str, Any]:
-    """Efficiency over the estimator `base`, per setting and decade; how uneven its relative errors are."""
+def gains(rows: Sequence[Measured], base: str, headline: str, tail: str) -> dict[str, Any]:
+    """Efficiency over the estimator `base`, per setting and decade, with its relative standard error; how uneven an
+    estimator's relative errors are, None where a decade is not known. Only columns count that every estimator knows.
+    """
     of = {row.name: row for row in rows}  # the last of a name, that with the most walks
-    ratio = {n: by_decade(r.efficiency / of[base].efficiency) for n, r in of.items() if n != base}
-    even = {n: float(np.sqrt(np.nanmax(r.variance) / np.nanmin(r.variance))) for n, r in of.items()}
-    first = "effort 3" if "effort 3" in ratio else "lobes"
+    known = np.all([row.known for row in of.values() if row.name != "volpath"], axis=0) & of[base].known
+    cost = {n: r.variance(known) * r.seconds[:, None] for n, r in of.items()}
+    mean = {n: c.mean(axis=0) for n, c in cost.items()}
+    error = {n: c.std(axis=0, ddof=1) / np.sqrt(len(c)) / mean[n] for n, c in cost.items()}
+    others = [n for n in of if n != base]
+    ratio = {n: by_decade(mean[base] / mean[n]) for n in others}
+    even = {n: np.sqrt(r.variance(r.known).mean(axis=0)) for n, r in of.items()}
     return {
-        f"gain_over_{base}_by_decade{tail}": ratio[first],
+        f"gain_over_{base}_by_decade{tail}": ratio[headline],
         f"gain_over_{base}_by_setting{tail}": ratio,
-        f"unevenness_beside_{base}{tail}": even,
+        f"gain_error_over_{base}_by_setting{tail}": {n: by_decade(np.hypot(error[base], error[n])) for n in others},
+        f"error_by_decade_beside_{base}{tail}": {n: by_decade(e * np.sqrt(of[n].walks)) for n, e in even.items()},
+        f"unevenness_beside_{base}{tail}": {
+            n: float(e.max() / e.min()) if np.isfinite(e).all() else None for n, e in even.items()
+        },
     }
 
 
@@ -117,9 +150,10 @@ def curves(title: str, rows: Sequence[Measured]) -> list[dict[str, Any]]:
     """Error against seconds, a line for each estimator and decade."""
     found: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
-        for d, variance in enumerate(row.variance):
+        seconds = float(row.seconds.mean())
+        for d, variance in enumerate(row.variance(row.known).mean(axis=0)):
             if np.isfinite(variance):
-                point = {"seconds": row.seconds, "error": float(np.sqrt(variance)), "settings": {"walks": row.walks}}
+                point = {"seconds": seconds, "error": float(np.sqrt(variance)), "settings": {"walks": row.walks}}
                 found.setdefault(f"{title}: {row.name}, decade {-d}", []).append(point)
     return [{"name": name, "points": points} for name, points in found.items()]
 
@@ -136,20 +170,31 @@ def per_decade(samples: F64, truth: F64) -> F64:
     return np.array(found)
 
 
-def measured(name: str, walks: int, run: Callable[[int, int], F64], truth: F64, seed: int = 500) -> Iterator[Measured]:
-    """Run `run(walks, seed)`, which returns (REPLICATES, columns, entries), once to compile, then by the clock with
-    growing numbers of walks.
+def compare(jobs: Sequence[Job], truth: F64) -> list[Measured]:
+    """Every estimator once to compile, then by the clock with growing numbers of walks, all of them by turns; truth
+    (columns, entries).
     """
-    run(max(1, walks // 50), 1)
-    for point, share in enumerate(SHARES):
-        count = max(1, round(walks * share))
+
+    def once(job: Job, walks: int, seed: int) -> tuple[float, F64]:
         start = time.process_time()
-        samples = run(count, seed + point)
+        samples = job.run(walks, seed)
         seconds = time.process_time() - start
-        variances = [per_decade(samples[:, k], truth[k]) for k in range(len(truth))]
-        known = np.isfinite(variances)
-        mean = np.where(known, variances, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-        yield Measured(name, count, seconds / REPLICATES / len(truth), np.where(known.any(axis=0), mean, np.nan))
+        return seconds / REPLICATES / len(truth), np.stack(
+            [per_decade(samples[:, k], truth[k]) for k in range(len(truth))]
+        )
+
+    def measured(job: Job, walks: int, runs: Sequence[tuple[float, F64]]) -> Measured:
+        return Measured(job.name, walks, np.array([r[0] for r in runs]), np.stack([r[1] for r in runs]))
+
+    for job in jobs:
+        job.run(max(1, job.walks // 50), 1)
+    rows = []
+    for point, share in enumerate(SHARES):
+        for job in jobs:
+            walks = max(1, round(job.walks * share))
+            rows.append(measured(job, walks, [once(job, walks, 500 + point)]))
+    turns = [[once(job, job.walks, 600 + turn) for job in jobs] for turn in range(TURNS)]
+    return rows + [measured(job, job.walks, runs) for job, runs in zip(jobs, zip(*turns, strict=True), strict=True)]
 
 
 def objects(quick: bool) -> Iterator[tuple[str, Any, Any, list[int]]]:
@@ -185,8 +230,8 @@ def objects(quick: bool) -> Iterator[tuple[str, Any, Any, list[int]]]:
     )
 
 
-def columns_of(obj: Any, basis: Any, columns: Sequence[int], quick: bool) -> Iterator[Measured]:
-    """R_d's columns without splitting and with it."""
+def columns_of(obj: Any, basis: Any, columns: Sequence[int], quick: bool) -> tuple[F64, list[Job]]:
+    """R_d's columns: the truth, and the walk without splitting and with it."""
     from disco_twin.light.importance import Splitting
     from disco_twin.light.sources import HatSource
     from disco_twin.light.transport import Transport
@@ -213,16 +258,15 @@ def columns_of(obj: Any, basis: Any, columns: Sequence[int], quick: bool) -> Ite
 
         return made
 
-    scale = 2 if quick else 10
-    truth = run(10.0)(1000 * scale, 9).mean(axis=0)
-    yield from measured("analogue", 2000 * scale, run(None, local=False), truth)
+    scale = 2 if quick else 5
+    truth = run(10.0)(2000 * scale, 9).mean(axis=0)
+    jobs = [Job("analogue", 2000 * scale, run(None, local=False))]
     if transport.uses_local_majorants():
-        yield from measured("local majorants", 2000 * scale, run(None), truth)
-    for effort in EFFORTS:
-        yield from measured(f"effort {effort:g}", max(20, int(1800 * scale / effort)), run(effort), truth)
+        jobs.append(Job("local majorants", 2000 * scale, run(None)))
+    return truth, jobs + [Job(f"effort {e:g}", max(20, int(1800 * scale / e)), run(e)) for e in EFFORTS]
 
 
-def images(name: str, obj: Any, quick: bool) -> Iterator[Measured]:
+def images(name: str, obj: Any, quick: bool) -> tuple[F64, list[Job]]:
     """A spot's image, at one pixel a vertex's footprint, by every estimator; volpath on `quick` alone."""
     from disco_twin.light.importance import Splitting
     from disco_twin.light.sources import BeamSource
@@ -240,7 +284,7 @@ def images(name: str, obj: Any, quick: bool) -> Iterator[Measured]:
     axis = -origin / np.linalg.norm(origin)
     tags = np.tile(origin, (REPLICATES, 1)), np.tile(axis, (REPLICATES, 1))
     entries = np.tile(-axis * 17.0 * size, (REPLICATES, 1))
-    transports = {"exits": Transport(obj, lobe=Lobe(100.0, 0.0, 0.0)), "lobes": Transport(obj)}
+    transports = {"exits": Transport(obj, lobe=Lobe(100.0, 0.0, 0.0), local=False), "lobes": Transport(obj)}
 
     def run(name: str, effort: float | None) -> Callable[[int, int], F64]:
         split = None if effort is None else Splitting(entries, effort)
@@ -255,19 +299,17 @@ def images(name: str, obj: Any, quick: bool) -> Iterator[Measured]:
 
         return made
 
-    scale = 1 if quick else 5
-    truth = run("lobes", 3.0)(1500 * scale, 9).mean(axis=0)
-    yield from measured("exits", 4000 * scale, run("exits", None), truth)
-    yield from measured("lobes", 2000 * scale, run("lobes", None), truth)
+    scale = 1 if quick else 4
+    truth = run("lobes", 10.0)(1000 * scale, 9).mean(axis=0)
+    jobs = [Job("exits", 4000 * scale, run("exits", None)), Job("lobes", 2000 * scale, run("lobes", None))]
     for effort in EFFORTS[1:]:
-        yield from measured(
-            f"lobes, effort {effort:g}", max(20, int(1000 * scale / effort)), run("lobes", effort), truth
-        )
+        jobs.append(Job(f"lobes, effort {effort:g}", max(20, int(1000 * scale / effort)), run("lobes", effort)))
     if name == "quick":
-        yield from volpath_images(obj, camera, origin, radius, truth, scale)
+        jobs.append(volpath_images(obj, camera, origin, radius, truth, scale))
+    return truth, jobs
 
 
-def volpath_images(obj: Any, camera: Any, origin: F64, radius: float, truth: F64, scale: int) -> Iterator[Measured]:
+def volpath_images(obj: Any, camera: Any, origin: F64, radius: float, truth: F64, scale: int) -> Job:
     """The same spot by stock volpath, which starts at the camera and connects to a spot light at the boundary."""
     import mitsuba as mi
 
@@ -286,4 +328,4 @@ def volpath_images(obj: Any, camera: Any, origin: F64, radius: float, truth: F64
             image = np.stack(made)[..., 0].reshape(REPLICATES, 1, -1).astype(float)
             return np.asarray(image * (truth.sum() / image.mean(axis=0).sum()))  # 1 W instead of 1 W/sr
 
-        yield from measured("volpath", 4 * scale, volpath, truth)
+        return Job("volpath", 4 * scale, volpath)
