@@ -19,6 +19,7 @@ F64 = NDArray[np.float64]
 
 PLACE_SHARE = 2e-4  # a board's corners tell its plane's area to about this
 PLACE_FREEDOM = 1.5  # few: places that do differ by far more than that are believed
+PLACE_LARGEST = 0.02  # more would be a plate that was mistaken for another
 
 
 @dataclass(frozen=True)
@@ -99,9 +100,10 @@ def place_variance(cameras: Sequence[Places]) -> float:
     """Expected square of what each place is off by, as a share.
 
     The places' standard deviation has Student's half-t distribution about zero as prior (Gelman 2006), for a few places
-    alone hardly tell it; every camera's mean is integrated out. The integral over the standard deviation is a sum.
+    alone hardly tell it; every camera's mean is integrated out. The integral over the standard deviation is a sum, up
+    to `PLACE_LARGEST`. Where every camera saw one place only, what is left is the prior's: .09 %.
     """
-    spread = PLACE_SHARE * np.geomspace(1e-2, 1e3, 400)
+    spread = np.geomspace(1e-2 * PLACE_SHARE, PLACE_LARGEST, 400)
     likely = -0.5 * (PLACE_FREEDOM + 1.0) * np.log1p((spread / PLACE_SHARE) ** 2 / PLACE_FREEDOM)
     for places in cameras:
         precision = 1.0 / (places.variance + spread[:, None] ** 2)

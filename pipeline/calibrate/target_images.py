@@ -138,6 +138,12 @@ def _plates(
         why = f" (in {dark} of them the photodiode read nothing)" if dark else ""
         remedy = "check the lasers and the photodiode" if dark else "check the plate's place"
         raise DiscoError(f"{targets.camera}: the white plate's spots are not seen{why}. Remedy: {remedy}")
+    if len(set(place)) == 1:
+        log.warning(
+            "%s: the white plate was seen in one place only: by how much its places differ is assumed, not measured. "
+            "Remedy: photograph it, and the board in the same mount, in a second place",
+            targets.camera,
+        )
     white = balance(np.array(light).T, np.array(reading).T, np.ones(lasers), np.array(place))
     return white, np.array(points), np.array(steps, float)
 
