@@ -28,10 +28,11 @@ from hw.devices.ophir import OphirMeter
 from hw.devices.turning import Table
 from hw.devices.zaber import BAUD as ZABER_BAUD
 from hw.devices.zaber import ZaberTable
-from hw.errors import DeviceError, DeviceFault, InputError
+from hw.errors import DeviceError, DeviceFault, DiscoError, InputError
 from hw.interface import Camera
-from hw.rig import SerialRig
+from hw.rig import SerialRig, close_all
 from hw.serial_link import Link
+from hw.signals import uninterrupted
 from hw.wiring import Board, Devices, Head, LaserWiring
 from pipeline.rig import RigConfig
 
@@ -76,16 +77,27 @@ class Connector:
             raise (named if self.file.path is None else named.within(self.file.path)) from error.__cause__
 
     def omicron(self, index: int) -> OmicronLaser:
-        """A laser's driver; connecting switches it off."""
+        """A laser's driver; connecting switches it off. Closed again if its power cannot be set."""
+        head = self._dark(index)
+        try:
+            self._require_settable(index, head)
+        except BaseException:
+            head.close()
+            raise
+        return head
+
+    def _dark(self, index: int) -> OmicronLaser:
+        """A laser that is switched off, whatever power the rig file names."""
         device = self.file.lasers[index]
         name = f"laser {device.wavelength_nm:g} nm"
-
-        def driver(link: Link) -> OmicronLaser:
-            head = OmicronLaser(link, device.wavelength_nm)
-            self._require_settable(index, head)
-            return head
-
-        return self._opened(f"lasers[{index}].port", device.baud, name, f"laser{index}", driver, guarded=True)
+        return self._opened(
+            f"lasers[{index}].port",
+            device.baud,
+            name,
+            f"laser{index}",
+            lambda link: OmicronLaser(link, device.wavelength_nm),
+            guarded=True,
+        )
 
     def _require_settable(self, index: int, head: OmicronLaser) -> None:
         """Refuse a power that this laser cannot be set to: one in watts or microwatts, or another laser's."""
@@ -113,10 +125,9 @@ class Connector:
             raise InputError("the rig file has no power meter", file=self.file.path, key="power_meter", remedy=remedy)
         return self._opened("power_meter.port", OPHIR_BAUD, "power meter", "power_meter", OphirMeter)
 
-    def laser(self, index: int) -> Head:
+    def _followed(self, index: int, head: OmicronLaser) -> Head:
         """A laser as the rig uses it."""
-        device, head = self.file.lasers[index], self.omicron(index)
-        if device.port == EMULATED or not self._follow or self.emulation is None:
+        if self.file.lasers[index].port == EMULATED or not self._follow or self.emulation is None:
             return head
         return FollowedHead(head, self.emulation.bench, index)
 
@@ -145,17 +156,35 @@ class Connector:
         return PlacedTable(table, float(np.deg2rad(device.zero_deg)), device.direction, told)
 
     def connect(self) -> Devices:
-        """All of them, or none. The lasers first: connecting switches them off."""
-        with ExitStack() as opened:
-            heads = []
-            for index in range(len(self.file.lasers)):
-                heads.append(self.laser(index))
-                opened.callback(heads[-1].close)
-            board = self.board()
-            opened.callback(board.close)
+        """All of them, or none. Whatever fails, what an earlier program left lit is told to go dark first.
+
+        The board shuts gates and lamps, then every laser is switched off in being connected, whatever the others say;
+        nothing is refused, and no Ctrl-C heard, before that.
+        """
+        boards: list[Board] = []
+        heads: list[OmicronLaser] = []
+        failed: list[DiscoError] = []
+
+        def attempt(step: Callable[[], T], into: list[T]) -> None:
+            try:
+                into.append(step())
+            except DiscoError as error:
+                failed.append(error)
+
+        try:
+            with uninterrupted():
+                attempt(self.board, boards)
+                for index in range(len(self.file.lasers)):
+                    attempt(partial(self._dark, index), heads)
+            for error in failed:
+                raise error
+            for index, head in enumerate(heads):
+                self._require_settable(index, head)
             table = self.table()
-            opened.pop_all()
-        return Devices(heads, board, table)
+        except BaseException:
+            close_all(self.clock, [*boards, *heads])
+            raise
+        return Devices([self._followed(index, head) for index, head in enumerate(heads)], boards[0], table)
 
 
 def _nobody(angle_deg: float) -> None:

@@ -19,7 +19,7 @@ from hw.interface import Aim, Camera, Floodlight, Laser, LaserReading, Photodiod
 from hw.rig_parts import AdcPhotodiode, GatedLaser, Mirrors, TtlFloodlight, Turning
 from hw.signals import uninterrupted
 from hw.trusted_board import HEARD_S, TrustedBoard
-from hw.wiring import Board, Devices, Head, LaserWiring
+from hw.wiring import Board, Closable, Devices, Head, LaserWiring
 
 log = logging.getLogger(__name__)
 
@@ -114,17 +114,17 @@ class SerialRig:
     def make_safe(self) -> None:
         """Gates shut, lasers and lamps off, ports given back. No device's failure stops another's, or is raised.
 
-        First every laser is told; then each device confirms in being closed, which one that has fallen silent can draw
-        out for seconds. The board is told in the first step of being closed. Ctrl-C waits until all that is done.
+        First gates and lasers are told; then each device confirms in being closed, which one that has fallen silent can
+        draw out for seconds. Ctrl-C waits until all that is done.
         """
         with uninterrupted():
             devices, self._devices, self._board, self.last_open = self._devices, None, None, -1
             if devices is None:
                 return
-            interruptions = _each(self.clock, [head.off_now for head in devices.heads])
-            closing = [devices.board.close, *(head.close for head in devices.heads), devices.table.close]
-            for interruption in [*interruptions, *_each(self.clock, closing)]:
-                raise interruption
+            try:
+                cut_light(self.clock, devices.board, devices.heads)
+            finally:
+                close_all(self.clock, [devices.board, *devices.heads, devices.table])
 
     def cut(self) -> None:
         """Tell gates and lasers to go dark without waiting for answers; the rig must be entered anew then."""
@@ -213,6 +213,13 @@ def cut_light(clock: Clock, board: Board, heads: Sequence[Head]) -> None:
     clock.sleep(HEARD_S)
     for interruption in interruptions:
         raise interruption
+
+
+def close_all(clock: Clock, devices: Sequence[Closable]) -> None:
+    """Close them side by side, whatever the others raise; Ctrl-C waits until then."""
+    with uninterrupted():
+        for interruption in _each(clock, [device.close for device in devices]):
+            raise interruption
 
 
 def _each(clock: Clock, steps: Sequence[Callable[[], None]]) -> list[BaseException]:

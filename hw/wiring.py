@@ -9,6 +9,12 @@ from typing import Protocol
 from hw.devices.turning import Table
 
 
+class Closable(Protocol):
+    """Any driver."""
+
+    def close(self) -> None: ...
+
+
 class Head(Protocol):
     """A laser's driver (`hw.devices.omicron.OmicronLaser`, or a guard in front of it)."""
 

@@ -1,0 +1,101 @@
+"""Connecting to what an earlier program left lit: whatever fails, everything that can be reached is dark afterwards."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from test_capture_twin import RIG, Glow
+
+from disco_twin.assembly import Connector
+from disco_twin.firmware.bench import FLOOD_LINE, LAMP_LINE
+from disco_twin.firmware.emulate import Emulation
+from disco_twin.rig import TwinRig
+from disco_twin.rig_commands import rig_file_of
+from disco_twin.rig_rules import load_rig_file
+from hw.devices.mm_ard import MirrorBoard
+from hw.devices.omicron import OmicronLaser
+from hw.devices.omicron_protocol import Mode
+from hw.errors import DeviceError, InputError
+
+LIT = 1 << LAMP_LINE | 1 << FLOOD_LINE | 0b11
+
+
+def left_on() -> Emulation:
+    """Lasers, gates and lamps as a program that was killed together with its guards leaves them."""
+    emulated = Emulation(TwinRig(RIG, Glow(), seed=5))
+    emulated.bench.board.set_pattern(LIT)
+    for head in emulated.bench.heads:
+        head.mode, head.level, head.on_since = int(Mode.BIAS | Mode.RELEASE), 1.0, emulated.clock.now() - 60.0
+    return emulated
+
+
+def connector(emulated: Emulation, folder: Path, change: tuple[str, str] = ("", "")) -> Connector:
+    path = folder / "rig.toml"
+    path.write_text(rig_file_of(RIG, {}).replace(*change, 1))
+    return Connector(load_rig_file(path), emulated.clock, emulated, None)
+
+
+def silent(name: str) -> Callable[[Emulation], None]:
+    """A device whose adapter lives, and which hears nothing."""
+
+    def fall(emulated: Emulation) -> None:
+        emulated.lines[name].firmware.feed = lambda data, now: []  # type: ignore[method-assign]
+
+    return fall
+
+
+@pytest.mark.parametrize("fault", ["laser0 unplugged", "laser0 silent", "laser1 silent", "turntable unplugged"])
+def test_a_device_that_fails_leaves_nothing_else_lit(tmp_path: Path, fault: str) -> None:
+    """Expected: gates and lamps shut, every laser that can be reached off, and the error of the one that failed."""
+    emulated = left_on()
+    name, kind = fault.split()
+    if kind == "silent":
+        silent(name)(emulated)
+    connect = connector(emulated, tmp_path)
+    if kind == "unplugged":
+        emulated.lines[name].unplug()
+    with pytest.raises(DeviceError, match={"laser0": "laser 635 nm", "laser1": "laser 532 nm"}.get(name, name)):
+        connect.connect()
+    assert emulated.bench.board.lines == 0
+    assert [head.on_since is not None for head in emulated.bench.heads] == [f"laser{i}" == name for i in range(3)]
+
+
+def test_a_board_that_fails_leaves_no_laser_on(tmp_path: Path) -> None:
+    emulated = left_on()
+    connect = connector(emulated, tmp_path)
+    emulated.lines["board"].unplug()
+    with pytest.raises(DeviceError, match="mirror board"):
+        connect.connect()
+    assert not any(head.on_since for head in emulated.bench.heads)
+
+
+def test_a_wrong_power_is_refused_in_the_dark(tmp_path: Path) -> None:
+    """power_mw beyond what the first laser says of itself: a slip of the pen must not keep the others lit."""
+    emulated = left_on()
+    with pytest.raises(InputError, match=r"lasers\[0\]\.power_mw = 11\.0.*at most 10"):
+        connector(emulated, tmp_path, ("power_mw = 10.0", "power_mw = 11.0")).connect()
+    assert emulated.bench.board.lines == 0 and not any(head.on_since for head in emulated.bench.heads)
+
+
+@pytest.mark.parametrize("moment", ["board", "laser"])
+def test_ctrl_c_in_connecting_is_heard_in_the_dark(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str
+) -> None:
+    """Before the board, or the first laser, has said who it is."""
+    emulated = left_on()
+    driver = MirrorBoard if moment == "board" else OmicronLaser
+    identify, pressed = driver._identify, []
+
+    def interrupted(self: object, *rest: object) -> object:
+        if not pressed:
+            pressed.append(True)
+            signal.raise_signal(signal.SIGINT)
+        return identify(self, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(driver, "_identify", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        connector(emulated, tmp_path).connect()
+    assert emulated.bench.board.lines == 0 and not any(head.on_since for head in emulated.bench.heads)
