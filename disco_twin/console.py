@@ -131,8 +131,8 @@ def quality_table(views: Sequence[ViewQuality]) -> Table:
             f"{v.stored}/{v.planned}",
             f"{100 * v.saturated:.2f} %",
             f"{100 * v.significant:.1f} %",
-            f"{v.range_db:.0f} dB",
+            f"{v.range_db:.0f} dB" if v.stored else "-",
             f"{v.dark}/{v.spots}",
-            " ".join(f"{1e3 * p:.2f}" for p in v.power_w),
+            " ".join("-" if math.isnan(p) else f"{1e3 * p:.2f}" for p in v.power_w),
         )
     return table

@@ -205,13 +205,13 @@ def pareto_figure(points: Mapping[str, tuple[float, float]]) -> Figure:
     """Error against time: per method (seconds, rms of nrmse over lights and views)."""
     figure, axis = new_figure(5.0, 3.0)
     for method, (seconds, error) in points.items():
-        axis.plot(max(seconds, 1e-2), error, "o", ms=9, color=colour(method))
-        axis.annotate(method, (max(seconds, 1e-2), error), (8, 4), textcoords="offset points", color=colour(method))
+        axis.plot(max(seconds, 1e-2), error, "o", ms=9, color=colour(method), label=method)
     axis.set_xscale("log")
     axis.set_yscale("log")
     for side in (axis.xaxis, axis.yaxis):
         label_log_axis(side)
     axis.margins(x=0.25, y=0.2)
+    axis.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))  # labels at the points met each other
     axis.set_xlabel("reconstruction and relighting, s")
     axis.set_ylabel("nrmse, all lights and views (rms)")
     return figure

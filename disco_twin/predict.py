@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
+
 from disco_twin.noise import walks_below_camera
 from disco_twin.simulate import holds_reference
 from disco_twin.world import World, left_out_by_the_twin
@@ -39,6 +41,8 @@ def predict(world: World, shipped: Path) -> list[tuple[str, str]]:
     images = len(plan)
     pixels = scene.rig.cameras[0].width * scene.rig.cameras[0].height
     raw = images * pixels * BYTES_PER_PIXEL
+    responses = len(plan.spots) * plan.lasers * len(scene.rig.cameras) * pixels
+    scratch = responses * 2 * np.dtype(np.float32).itemsize  # image and variance
     work = scene.simulation
     cores, views = usable_cores(), scene.relight.views
     lights = sum(not all(holds_reference(shipped, world, x, v) for v in views) for x in scene.relight.lights)
@@ -47,7 +51,11 @@ def predict(world: World, shipped: Path) -> list[tuple[str, str]]:
     lines = [
         ("scene", f"{scene.name}: {triangles} triangles, scan of {vertices} vertices"),
         ("images", f"{images}: {plan.views} views, {len(plan.spots)} spots, {plan.lasers} lasers"),
-        ("bytes", f"{raw / 1e6:.0f} MB raw, about {raw / COMPRESSION / 1e6:.1f} MB stored"),
+        (
+            "bytes",
+            f"{raw / 1e6:.0f} MB raw, about {raw / COMPRESSION / 1e6:.1f} MB stored; {scratch / 1e6:.0f} MB more of "
+            "simulated responses in OUT/twin (none with real cameras)",
+        ),
         ("real rig", f"about {images / IMAGES_PER_S / 60:.1f} minutes of acquisition"),
     ]
     if scene.rig.faults.deviation:

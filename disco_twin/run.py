@@ -107,7 +107,13 @@ def choose_methods(text: str | None, scene: Scene) -> tuple[str, ...]:
     unknown = [m for m in chosen if m not in METHODS]
     if unknown or not chosen:
         value = unknown[0] if unknown else text
-        raise InputError("unknown method", key="--methods", value=value, allowed=f"all, {', '.join(METHODS)}")
+        raise InputError(
+            "unknown method",
+            key="--methods",
+            value=value,
+            allowed=f"all, {', '.join(METHODS)}",
+            remedy="choose from these",
+        )
     return tuple(dict.fromkeys([*chosen, *BASELINES]))
 
 
@@ -205,7 +211,11 @@ def score_stages(run: Run) -> dict[str, Any]:
     done = run.folder.stages
     for name in ("capture", "truth", "references", "pipeline"):
         if name not in done or not done[name].finished:
-            raise InputError(f"the stage {name} is not finished", file=run.folder.root, remedy="disco-twin run")
+            raise InputError(
+                f"the stage {name} is not finished",
+                file=run.folder.root,
+                remedy=f"disco-twin run {run.scene_file} --out {run.folder.root}",
+            )
     if why := stale(run.scene, run.folder, run.methods):
         remedy = f"disco-twin reconstruct --out {run.folder.root} --methods {','.join(run.methods)}"
         raise InputError(why, file=run.folder.work, key="--methods", value=",".join(run.methods), remedy=remedy)

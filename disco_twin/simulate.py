@@ -55,6 +55,14 @@ def require_capturable(world: World) -> None:
     for i, view in enumerate(world.scene.relight.views):
         require_in_sight(view, world.scan, f"relight.views[{i}]", f"the held-out view {view.name!r}")
     world.plan  # noqa: B018 - the plan refuses cameras, projector and spots that cannot be
+    from pipeline.calibrate.projector_fit import LEAST_SPOTS
+
+    rig = world.scene.rig
+    if rig.faults.deviation and rig.spots < LEAST_SPOTS:
+        raise InputError(
+            "too few to find the projector from, and the rig is off the nominal one", key="rig.spots", value=rig.spots,
+            allowed=f"at least {LEAST_SPOTS} that a camera sees", remedy="more spots, or --no-faults",
+        )  # fmt: skip
 
 
 def _require_equal_sizes(cameras: Sequence[CameraConfig], key: str) -> None:

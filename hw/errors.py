@@ -122,9 +122,13 @@ def naming(file: str | Path) -> Iterator[None]:
 def refused_by_the_disk(error: OSError, folder: Path) -> DiscoError | None:
     """A full or write-protected disk, or a path that cannot be, as an error for the user; None for any other reason.
 
-    NumPy reports a full disk without an error number ("16 requested and 0 written").
+    NumPy reports a full disk without an error number ("16 requested and 0 written", "Not enough free space to write").
     """
-    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or "requested and" in str(error)
+    if error.errno == errno.EFBIG:
+        remedy = "raise the limit (ulimit -f) or choose another disk, repeat the same command"
+        return DiscoError(f"{error.filename or folder}: no file may be that large here. Remedy: {remedy}")
+    said = str(error)
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT) or "requested and" in said or "Not enough free space" in said
     if not full and error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.ENAMETOOLONG):
         return None
     why = "the disk is full" if full else (error.strerror or str(error)).lower()

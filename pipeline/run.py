@@ -208,7 +208,10 @@ def run(capture: Path, work: Path, request: Request, given: Path | None = None) 
         "left_out": [item.row() for item in left_out],
         "warnings": [
             *warnings_of(statistics),
-            *(f"pose: {text}" for text in calibrated.get("silhouettes", {}).get("ambiguity", ())),
+            *(
+                f"pose: the silhouettes leave open: {text}"
+                for text in calibrated.get("silhouettes", {}).get("ambiguity", ())
+            ),
         ],
     }
     write_json(work / "pipeline.json", result)

@@ -21,6 +21,7 @@ from disco_twin.deviation import ActualRig
 from disco_twin.light.sources import BeamSource, Source
 from disco_twin.light.transport import Transport
 from disco_twin.object.build import TwinObject
+from hw.errors import refused_by_the_disk
 from hw.interface import Aim
 from pipeline.calibrate.camera import PinholeCamera
 from pipeline.rig import RigConfig
@@ -98,8 +99,13 @@ class SpotResponses:
         path = self.scratch / f"spots-{name}.npy"
         if not path.exists():
             partial = path.with_suffix(".part")
-            with partial.open("wb") as file:
-                np.save(file, self._simulate(chunk))
+            simulated = self._simulate(chunk)
+            try:
+                with partial.open("wb") as file:
+                    np.save(file, simulated)
+            except OSError as error:  # NumPy's has no file name
+                partial.unlink(missing_ok=True)
+                raise refused_by_the_disk(error, path) or error from error
             os.replace(partial, path)
         return np.asarray(np.load(path, mmap_mode="r"))
 

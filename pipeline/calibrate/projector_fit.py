@@ -94,7 +94,10 @@ def projection(points: F64, steps: F64, tolerance: float, rng: np.random.Generat
 def require_depth(points: F64) -> None:
     """Refuse spots from which the projector's distance cannot be told."""
     if len(points) < LEAST_SPOTS:
-        raise DiscoError(f"{len(points)} spots, {LEAST_SPOTS} are needed. Remedy: more spots per turntable angle")
+        raise DiscoError(
+            f"{len(points)} spots were seen by a camera, {LEAST_SPOTS} are needed to find the projector. "
+            "Remedy: capture more spots (rig.spots of the scene)"
+        )
     extent = np.sqrt(np.linalg.eigvalsh(np.cov(points.T)))
     if extent[0] < FLAT * extent[2]:
         raise DiscoError(

@@ -26,7 +26,7 @@ from disco_twin.scene import Scene, load_scene
 from disco_twin.score import load_relit, load_scores
 from disco_twin.simulate import render_references, require_capturable
 from disco_twin.world import World
-from hw.errors import InputError, naming
+from hw.errors import InputError, naming, refused_by_the_disk
 from pipeline.config import read_json
 from pipeline.lens import covers_image
 from pipeline.records import MethodFigures, PipelineRecord, RigFile
@@ -88,6 +88,35 @@ def test_devices_that_cannot_see_the_object(changes: dict[str, object], parts: l
     with pytest.raises(InputError) as caught:
         require_capturable(sphere(**changes))
     one_line(caught, *parts)
+
+
+def test_too_few_spots_are_refused_before_they_are_taken() -> None:
+    """A rig that is off the nominal one is calibrated by its spots; one that is not can do with any."""
+    with pytest.raises(InputError) as caught:
+        require_capturable(
+            sphere(cameras=[CAMERA | {"position_mm": (450, 0, 50)}], spots=3, faults={"deviation": True})
+        )
+    one_line(caught, "rig.spots = 3", "at least 12", "Remedy: ")
+    require_capturable(sphere(cameras=[CAMERA | {"position_mm": (450, 0, 50)}], spots=3))
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (
+            OSError("Not enough free space to write 22855680 bytes after offset 128"),
+            "the disk is full. Remedy: make room",
+        ),
+        (OSError("16 requested and 0 written"), "the disk is full. Remedy: make room"),
+        (OSError(errno.ENOSPC, "No space left on device"), "the disk is full. Remedy: make room"),
+        (OSError(errno.EFBIG, "File too large"), "no file may be that large here. Remedy: raise the limit (ulimit -f)"),
+    ],
+)
+def test_a_full_disk_is_told_from_a_limit_of_files(error: OSError, said: str) -> None:
+    """NumPy's own words for a full disk have neither number nor file."""
+    known = refused_by_the_disk(error, Path("out/twin"))
+    assert str(known).startswith(f"out/twin: {said}")
+    assert refused_by_the_disk(OSError(errno.EIO, "Input/output error"), Path("out")) is None
 
 
 def test_an_error_about_a_key_names_the_scene() -> None:
