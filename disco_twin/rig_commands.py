@@ -18,8 +18,9 @@ from disco_twin.rig_file import EMULATED, DevicesFile, GenicamDevice, LaserDevic
 from hw.clock import Clock, WallClock
 from hw.devices.mm_ard import ADC_TOP
 from hw.devices.omicron import OmicronLaser
+from hw.devices.ophir import OphirMeter
 from hw.errors import DeviceFault, DiscoError, InputError
-from hw.rig import DARK_COUNTS, cut_light
+from hw.rig import DARK_COUNTS, cut_light, warm_up
 from hw.trusted_board import TrustedBoard
 from hw.wiring import Board
 from pipeline.rig import RigConfig
@@ -148,14 +149,25 @@ def probe(file: DevicesFile, scene: RigConfig | None, logs: Path | None = None) 
     if file.turntable.port != EMULATED:
         yield _try("turntable", table)
     if file.power_meter is not None and file.power_meter.port != EMULATED:
-        yield _try("power meter", lambda: f"reads {1e3 * _metered(connect):.3f} mW")
+        yield _try("power meter", partial(_meter_reads, connect))
     for device_, shape in _shapes(file, scene):
         yield _try(f"camera {device_.name}", partial(_camera_says, file, device_, shape))
 
 
-def _metered(connect: Connector) -> float:
+def _meter_reads(connect: Connector) -> str:
     with _using(connect.meter()) as meter:
-        return meter.read()
+        return f"reads {1e3 * meter.read():.3f} mW"
+
+
+@contextmanager
+def _metering(connect: Connector) -> Iterator[OphirMeter | None]:
+    """The real power meter, where there is one: found before a laser emits, since that takes seconds."""
+    device = connect.file.power_meter
+    if device is None or device.port == EMULATED:
+        yield None
+    else:
+        with _using(connect.meter()) as meter:
+            yield meter
 
 
 def _camera_says(file: DevicesFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
@@ -261,29 +273,34 @@ def _test_off(connect: Connector, index: int) -> str:
 
 
 def _test_laser(connect: Connector, board: Board, index: int) -> str:
-    """Emission behind its shut gate, then through it, against the set point; then off, gate open, against darkness."""
+    """Emission behind its shut gate, then through it, against the set point; then off, gate open, against darkness.
+
+    The gate is shut whenever a laser that is on is told something, since one that falls silent is asked for seconds.
+    """
     file, wiring = connect.file, connect.file.lasers[index]
-    head = connect.omicron(index)
-    with _light(connect.clock, board, head) as cut:
+    with _metering(connect) as meter, _light(connect.clock, board, head := connect.omicron(index)) as cut:
         trusted = TrustedBoard(board, connect.clock, [laser.gate_line for laser in file.lasers], cut)
         trusted.require_lines()
         trusted.aim(*file.board.centre)
         trusted.switch(free_line(file), True)
         head.arm(wiring.power_mw)
         head.emit()
-        connect.clock.sleep(file.warm_up_s)
+        warm_up(connect.clock, file.warm_up_s, [head])
         own = head.require_power(file.power_tolerance)
         _require_dark(trusted, wiring, head.name, "emits behind its shut gate", "see that its gate shuts")
+        head.require_guard()
         trusted.open_gate(wiring.gate_line)
         seen = _through_gate(trusted, wiring, head.name, own)
         counts = round(1e-3 * seen / wiring.watts_per_count)
-        meter = "" if file.power_meter is None else _meter_says(_metered(connect), counts)
+        metered = "" if meter is None else _meter_says(meter.read(), counts)
+        trusted.switch(wiring.gate_line, False)
         head.stop_emission()
         head.require_off()
+        trusted.open_gate(wiring.gate_line)
         _require_dark(trusted, wiring, head.name, "is off", "check the wiring of gate and interlock")
         return (
             f"set {wiring.power_mw:g} mW, own reading {own:.2f} mW, photodiode {seen:.2f} mW ({counts} counts)"
-            f"{meter}; off again"
+            f"{metered}; off again"
         )
 
 

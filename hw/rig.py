@@ -90,21 +90,13 @@ class SerialRig:
             for head, wiring in zip(devices.heads, self.wiring, strict=True):
                 head.arm(wiring.power_mw)
                 head.emit()
-            self._warm_up()
+            warm_up(self.clock, self._warm_up_s, devices.heads)
             self.check()
         except BaseException:
             self.make_safe()
             raise
         self._timebase.restart()
         return self
-
-    def _warm_up(self) -> None:
-        """Wait, and end at once where a laser's guard ends."""
-        left = self._warm_up_s
-        while left > 0:
-            self.clock.sleep(min(left, GUARDS_EVERY_S))
-            left -= GUARDS_EVERY_S
-            self.require_guards()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -205,6 +197,16 @@ class SerialRig:
         self.devices()
         if self.open_gate >= 0:
             raise Refused(f"the {what} must not move while the gate of laser {self.open_gate} is open")
+
+
+def warm_up(clock: Clock, seconds: float, heads: Sequence[Head]) -> None:
+    """Wait while lasers that emit become steady, and end at once where the guard of one ends."""
+    left = seconds
+    while left > 0:
+        clock.sleep(min(left, GUARDS_EVERY_S))
+        left -= GUARDS_EVERY_S
+        for head in heads:
+            head.require_guard()
 
 
 def cut_light(clock: Clock, board: Board, heads: Sequence[Head]) -> None:

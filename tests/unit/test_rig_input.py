@@ -175,6 +175,16 @@ def test_power_in_another_unit_is_refused_by_what_the_laser_says_of_itself(
                 run.close()
 
 
+class Meter:
+    """A power meter's place."""
+
+    def read(self) -> float:
+        return 0.0095
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
 def test_the_self_test_compares_photodiode_own_reading_and_meter(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -182,12 +192,12 @@ def test_the_self_test_compares_photodiode_own_reading_and_meter(
     laser's own reading asks for; for the others the value that the power meter asks for.
     """
     quick(monkeypatch)
-    monkeypatch.setattr("disco_twin.rig_commands._metered", lambda connect: 0.0095)
+    monkeypatch.setattr("disco_twin.assembly.Connector.meter", lambda connect: Meter())
     with served(RIG, 3, tmp_path / "ports") as path:
         content = path.read_text()
         right = float(re.findall(r"watts_per_count = (\S+)", content)[0])
         content = content.replace(f"watts_per_count = {right!r}", f"watts_per_count = {2 * right!r}", 1)
-        path.write_text(content + '[power_meter]\nkind = "ophir"\nport = "emulated"\n')
+        path.write_text(content + '[power_meter]\nkind = "ophir"\nport = "/dev/ttyMETER"\n')
         found = {f.name: f.text for f in selftest(load_rig_file(path), None, armed=True)}
     first, second = found["laser 635 nm"], found["laser 532 nm"]
     said = re.search(r"gives 20.0\d mW \((\d+) counts\).*\(allowed: 1 to 15 mW\)", first)

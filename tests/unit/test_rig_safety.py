@@ -18,6 +18,7 @@ from disco_twin.rig import TwinRig
 from disco_twin.rig_commands import rig_file_of
 from disco_twin.rig_rules import load_rig_file
 from hw.bytelog import ByteLog
+from hw.devices.omicron import OmicronLaser
 from hw.errors import DeviceFault, DiscoError, Refused, SwitchedOff, Unplugged
 from hw.interface import gate_open
 from hw.rig import SerialRig
@@ -366,11 +367,11 @@ def test_a_guard_that_ends_while_lasers_warm_up_ends_it_at_once(monkeypatch: pyt
     rig._warm_up_s = 3600.0
     begun = emulated.clock.now()
 
-    def require_guards(self: SerialRig) -> None:
+    def require_guard(self: OmicronLaser) -> None:
         if emulated.clock.now() - begun > 100:
             raise SwitchedOff("port", "laser", "its guard process was killed", "see to it")
 
-    monkeypatch.setattr(SerialRig, "require_guards", require_guards)
+    monkeypatch.setattr(OmicronLaser, "require_guard", require_guard)
     with pytest.raises(SwitchedOff), rig:
         pass
     assert emulated.clock.now() - begun < 110
