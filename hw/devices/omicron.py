@@ -57,6 +57,7 @@ class OmicronLaser:
         self.link, self.framer = link, OmicronFramer()
         self._inbox: Inbox[str] = Inbox(link, self.framer)
         self._owed: set[str] = set()  # questions whose answer may still come
+        self._silent = False  # it answered none of the questions that were to bring us back into step
         self._temporary_power = True  # TPP is known, as far as we know
         self.identity = self._identify(wavelength_nm)
         self.armed_mw = 0.0
@@ -100,6 +101,7 @@ class OmicronLaser:
             problem = f"did not answer ?{letters}{arguments} within {ANSWER_S:g} s"
             raise NoAnswer(self.link.url, self.name, problem, "check cable and power of the laser")
         self._owed.discard(letters)
+        self._silent = False
         if answer.startswith("!UK"):
             raise DeviceRefused(
                 self.link.url, self.name, f"does not know ?{letters}{arguments}", "a laser of another kind?"
@@ -114,7 +116,9 @@ class OmicronLaser:
             self._owed.add(probe)
             if self._inbox.next(_begins("!" + probe), ANSWER_S) is not None:
                 self._owed.clear()
+                self._silent = False
                 return
+        self._silent = True
         self._inbox.drain(quiet_s=1.0)
         self._owed.clear()
 
@@ -197,7 +201,11 @@ class OmicronLaser:
     # ---- power and emission
 
     def force_off(self) -> None:
-        """No light, now and after a power cut: LOf, power 0, no autostart, operating release and bias off."""
+        """No light, now and after a power cut: LOf, power 0, no autostart, operating release and bias off.
+
+        What the laser does not obey, or cannot, keeps it from none of the others. One that answers nothing is left to
+        its guard, which insists: each of its questions would be waited for for nine seconds.
+        """
         self.armed_mw = 0.0
         failed: list[DeviceError] = []
         steps: tuple[Callable[[], None], ...] = (
@@ -211,6 +219,8 @@ class OmicronLaser:
                 step()
             except DeviceError as error:  # the other steps may still get through
                 failed.append(error)
+                if self._silent:
+                    break
         if failed:
             raise failed[0]
 

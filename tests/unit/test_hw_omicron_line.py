@@ -147,6 +147,20 @@ def test_a_failed_step_of_switching_off_does_not_stop_the_others(deaf: bytes) ->
     assert bool(bench.head.stored_mode & Mode.RELEASE) == (deaf == b"SOM")
 
 
+@pytest.mark.parametrize("told", [False, True])
+def test_a_silent_laser_is_closed_in_the_time_of_one_question(told: bool) -> None:
+    """Its adapter lives, it hears nothing. Expected: three attempts at LOf, then the port is its guard's."""
+    bench = LaserBench()
+    laser = emitting(bench)
+    bench.line.firmware.feed = lambda data, now: []  # type: ignore[method-assign]
+    if told:
+        laser.off_now()
+    begun = bench.now()
+    with pytest.raises(NoAnswer, match=r"LOf"):
+        laser.close()
+    assert 3.0 < bench.now() - begun < 9.5
+
+
 def test_nothing_but_commands_drives_the_laser_once_it_is_connected() -> None:
     """Its digital and analogue inputs are no gates: what hangs on them may not modulate the light."""
     inputs = Mode.DIGITAL | Mode.ANALOG | Mode.ADHOC

@@ -27,6 +27,7 @@ from disco_twin.rig_commands import rig_file_of
 from disco_twin.rig_rules import load_rig_file
 from hw.clock import VirtualClock, WallClock, side_by_side
 from hw.devices.mm_ard import MirrorBoard
+from hw.devices.omicron import OmicronLaser
 from hw.devices.omicron_protocol import Mode
 from hw.errors import DeviceFault
 from hw.guard import IS_OFF
@@ -192,6 +193,40 @@ def test_ports_that_were_all_pulled_are_closed_in_the_time_of_one(
         server.plug(name)
     assert [guard.wait(10) for guard in guards] == [IS_OFF] * 3
     assert not any(head.on_since for head in heads)
+
+
+def test_a_laser_that_has_fallen_silent_is_waited_for_once(whole: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its adapter lives: no write fails. Expected: one question's attempts (6 s here), then its guard's time (2 s)."""
+    emulated, _, path = whole
+    monkeypatch.setattr("hw.ports.protocol_guard.END_S", 2.0)
+    monkeypatch.setattr("hw.devices.omicron.ANSWER_S", 0.2)
+    rig = serial_rig(path)
+    rig.__enter__()
+    rig.lasers[0].open_gate()
+    firmware, guard = emulated.lines["laser0"].firmware, rig.devices().heads[0].link._port._guard  # type: ignore[attr-defined]
+    hear = firmware.feed
+    firmware.feed = lambda data, now: []  # type: ignore[method-assign]
+    begun = time.monotonic()
+    rig.make_safe()
+    assert time.monotonic() - begun < 13.0 and not rig.connected
+    assert emulated.bench.board.lines == 0
+    assert [head.on_since is not None for head in emulated.bench.heads] == [True, False, False]
+    firmware.feed = hear  # type: ignore[method-assign]
+    assert guard.wait(10) == IS_OFF and not any(head.on_since for head in emulated.bench.heads)
+
+
+def test_the_gate_does_not_wait_for_a_laser_that_takes_no_bytes(whole: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Expected: gates and lamps shut at once, while telling the laser still fails."""
+    emulated, _, path = whole
+    rig = serial_rig(path)
+    rig.__enter__()
+    rig.lasers[0].open_gate()
+    dark: list[float] = []
+    at_pattern(emulated, lambda pattern: not pattern, lambda: dark.append(time.monotonic()))
+    monkeypatch.setattr(OmicronLaser, "off_now", lambda self: time.sleep(2.0))
+    begun = time.monotonic()
+    rig.make_safe()
+    assert dark[0] - begun < 1.0
 
 
 @pytest.mark.parametrize("moment", ["before", "after"])
