@@ -131,9 +131,7 @@ class SensorDevice(Strict):
     gain_e_per_dn: Annotated[float, Field(ge=1e-6, le=1e6)]
     read_noise_e: Annotated[float, Field(ge=0, le=1e6)]
     dark_e_per_s: Annotated[float, Field(ge=0, le=1e9)] = 0.0
-    responsivity: tuple[
-        Annotated[float, Field(ge=1, le=1e24)], ...
-    ]  # electrons/s per pixel for 1 W/(mm^2 sr), one a laser
+    responsivity: tuple[Response, ...]  # electrons/s per pixel for 1 W/(mm^2 sr), one a laser
 
     def bracket(self) -> Bracket:
         """The exposures."""
