@@ -30,6 +30,7 @@ from hw.devices.zaber import BAUD as ZABER_BAUD
 from hw.devices.zaber import ZaberTable
 from hw.errors import DeviceError, DeviceFault, DiscoError, InputError
 from hw.interface import Camera
+from hw.ports.protocol_guard import PREFIX
 from hw.rig import SerialRig, close_all
 from hw.serial_link import Link
 from hw.signals import uninterrupted
@@ -60,7 +61,7 @@ class Connector:
         key: of the port in the rig file; name: of the device's emulated line and of its byte log
         """
         port = self.file.ports()[key]
-        url = self._urls[name] if port == EMULATED else f"guard://{port}" if guarded else port
+        url = self._urls[name] if port == EMULATED else f"{PREFIX}{port}" if guarded else port
         try:
             link = Link(
                 url, baud, device, self.clock, None if self.logs is None else ByteLog(self.logs / f"{name}.log")
@@ -240,6 +241,23 @@ def require_black(camera: GenicamCamera, sensor: SensorDevice) -> float:
 
 
 @contextmanager
+def keys_named(file: DevicesFile) -> Iterator[None]:
+    """Errors of devices that leave this block name the rig file and the key of the device's port.
+
+    Drivers know their port alone, and the rig calls its board `board`.
+    """
+    ports = {port: key for key, port in file.ports().items() if port != EMULATED}
+    try:
+        yield
+    except DeviceError as error:
+        port = file.board.port if error.port == "board" else error.port.removeprefix(PREFIX)
+        if error.key is not None or port not in ports:
+            raise
+        named = error.set_by(ports[port], port)
+        raise (named if file.path is None else named.within(file.path)) from error.__cause__
+
+
+@contextmanager
 def assembled(
     file: DevicesFile, scene: RigConfig, twin: TwinRig | None = None, logs: Path | None = None, *, armed: bool
 ) -> Iterator[SerialRig]:
@@ -253,7 +271,7 @@ def assembled(
     emulation = None if twin is None else Emulation(twin, clock)
     if emulation is None and (file.simulated_cameras or EMULATED in file.ports().values()):
         raise InputError("emulated devices and simulated cameras need a twin")
-    with ExitStack() as opened:
+    with keys_named(file), ExitStack() as opened:
         cameras: list[Camera] = []
         black: list[Callable[[], float]] = []
         if emulation is not None and file.simulated_cameras:

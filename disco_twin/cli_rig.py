@@ -65,10 +65,12 @@ def emulate(
         allowed = f"0.1 to {LONGEST_S:.0f}"
         raise InputError("is no such time", key="--seconds", value=seconds, allowed=allowed, remedy="choose another")
     loaded = load_scene(scene)
-    with served(loaded.rig, loaded.seed, folder) as path:
-        console.print(f"devices are served; rig file: {path}   (Ctrl-C ends it)", highlight=False, soft_wrap=True)
+    with interruptible():
         try:
-            time.sleep(seconds)
+            with served(loaded.rig, loaded.seed, folder) as path:
+                said = f"devices are served; rig file: {path}   (Ctrl-C ends it)"
+                console.print(said, highlight=False, soft_wrap=True)
+                time.sleep(seconds)
         except KeyboardInterrupt:
             console.print("ended")
 

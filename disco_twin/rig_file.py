@@ -183,7 +183,7 @@ class DevicesFile(Strict):
     @classmethod
     def load(cls, path: Path) -> DevicesFile:
         """Read a file; what its keys say of each other is `disco_twin.rig_rules`' business."""
-        rig = load_toml(path, cls, RIG_FILE)
+        rig = load_toml(path, cls, RIG_FILE, {"object": "a scene", "rig": "a scene"})
         rig._path = path
         return rig
 

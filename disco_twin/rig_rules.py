@@ -117,14 +117,17 @@ def _require_counts(index: int, laser: LaserDevice) -> None:
     if least <= laser.watts_per_count < most:
         return
     if laser.watts_per_count < least:
-        problem = "the photodiode's converter ends below power_mw"
-        remedy = "measure it with a power meter, or lower the photodiode's gain: full power is near 800 counts"
+        reason = "the photodiode's converter ends below power_mw"
     else:
         low = power_w * laser.photodiode_limits[0] / laser.watts_per_count
-        problem = f"the lower of photodiode_limits is {low:.2g} counts, and up to {DARK_COUNTS} are darkness"
-        remedy = "give it in watts (not mW) per count; full power is near 800 counts"
-    raise InputError(problem, key=f"lasers[{index}].watts_per_count", value=laser.watts_per_count,
-                     allowed=f"at least {least:.4g}, below {most:.4g}", remedy=remedy)  # fmt: skip
+        reason = f"the lower of photodiode_limits is {low:.2g} counts, and up to {DARK_COUNTS} are darkness"
+    problem = f"does not go with lasers[{index}].watts_per_count = {laser.watts_per_count:.4g}: {reason}"
+    allowed = f"with this power, watts_per_count at least {least:.4g}, below {most:.4g}"
+    remedy = (
+        "one of the two is in another unit: power_mw in mW, watts_per_count in W (not mW) per count, measured with a "
+        "power meter; or set the photodiode's gain so that full power is near 800 counts"
+    )
+    raise InputError(problem, key=f"lasers[{index}].power_mw", value=laser.power_mw, allowed=allowed, remedy=remedy)
 
 
 def _require_cameras(rig: DevicesFile) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -64,12 +66,31 @@ def served(scene: RigConfig, seed: int, folder: Path) -> Iterator[Path]:
     require_folder(folder, "--ports")
     lines, path = emulated_devices(scene, seed).lines, folder / "rig.toml"
     remedy = "choose another --ports, or take it away"
-    for port in (folder / name for name in lines):
-        if port.exists() and not port.is_symlink():
-            raise InputError("is in the place of an emulated device's port", file=port, remedy=remedy)
-    content = rig_file_of(scene, {name: str((folder / name).absolute()) for name in lines}).encode()
-    if path.exists() and path.read_bytes() != content:
-        raise InputError("is another rig file than the one to be written", file=path, remedy=remedy)
-    with Server(lines, folder):
-        write_atomically(path, content)
-        yield path
+    with _alone_in(folder):
+        for port in (folder / name for name in lines):
+            if port.exists() and not port.is_symlink():
+                raise InputError("is in the place of an emulated device's port", file=port, remedy=remedy)
+        content = rig_file_of(scene, {name: str((folder / name).absolute()) for name in lines}).encode()
+        if path.exists() and path.read_bytes() != content:
+            raise InputError("is another rig file than the one to be written", file=path, remedy=remedy)
+        with Server(lines, folder):
+            write_atomically(path, content)
+            yield path
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Refuse a folder in which another emulator serves: its links would be taken over, and taken away at the end.
+
+    The lock is the folder's own and ends with its program, however that ends: nothing is left behind.
+    """
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            problem, remedy = "an emulator that is running serves its devices here", "end it, or choose another --ports"
+            raise InputError(problem, file=folder, remedy=remedy) from error
+        yield
+    finally:
+        os.close(lock)

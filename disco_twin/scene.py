@@ -106,7 +106,7 @@ def load_scene(path: str | Path, profile: Profile = "full", faults: bool | None 
 
     faults: every fault of the rig is on or off, whatever the scene says
     """
-    scene = load_toml(path, Scene)
+    scene = load_toml(path, Scene, others={"board": "a rig file", "turntable": "a rig file"})
     if faults is not None:
         all_of_them = FaultsConfig(**dict.fromkeys(FaultsConfig.model_fields, faults))
         scene = scene.model_copy(update={"rig": scene.rig.model_copy(update={"faults": all_of_them})})

@@ -91,7 +91,9 @@ class Garbled(DeviceError):
 
 
 class Unplugged(DeviceError):
-    """The port cannot be opened, read or written."""
+    """The port cannot be opened, read or written. `known`: that was said before."""
+
+    known = False
 
 
 class SwitchedOff(Unplugged):

@@ -157,9 +157,12 @@ def _off(port: serial.Serial) -> bool:
     return done and status is not None and not int(status, 16) & ON_OR_PREHEATING
 
 
-def switch_off(url: str, baud: int, port: serial.Serial | None, patience_s: float) -> bool:
-    """Go on saying off until the laser confirms it, by a port that is opened anew whenever it fails."""
-    begun, complained = time.monotonic(), False
+def switch_off(url: str, baud: int, port: serial.Serial | None, patience_s: float, complained: bool = False) -> bool:
+    """Go on saying off until the laser confirms it, by a port that is opened anew whenever it fails.
+
+    complained: the user knows already that the laser may be on
+    """
+    begun = time.monotonic()
     while time.monotonic() < begun + patience_s:
         try:
             if port is None:
@@ -198,7 +201,7 @@ def guard(url: str, baud: int, host: socket.socket, program: Program) -> bool:
     except (*FAILURES, ValueError) as error:
         _tell(host, error)
         return True
-    relay, patience_s, ready = Relay(port, host), PATIENCE_S, False
+    relay, patience_s, ready, complained = Relay(port, host), PATIENCE_S, False, False
     try:
         _answers(port, OFF, re.compile(rb"!(LOf[^\r]*)\r"))  # all of it: the program asked for none of this
         host.sendall(READY)
@@ -207,15 +210,21 @@ def guard(url: str, baud: int, host: socket.socket, program: Program) -> bool:
     except (BrokenPipeError, ConnectionResetError):
         log.info("%s: switching off: its port was closed", url)
     except FAILURES as error:
-        log.warning("%s: the port is gone (%s); the laser will be switched off when it returns", url, error)
+        log.info("%s: the port is gone: %s", url, error)
         patience_s = RETURN_S
+        if relay.told_to_emit:
+            complained = True
+            log.error(
+                "%s: THE PORT IS GONE, AND THE LASER MAY BE ON. Open the interlock or turn its key; it will be "
+                "switched off when the port returns", url
+            )  # fmt: skip
         if not ready:
             _tell(host, error)
     finally:
         host.close()  # the program sees its port vanish
         if relay.told_to_emit:
             patience_s = RETURN_S
-        off = switch_off(url, baud, port, patience_s)
+        off = switch_off(url, baud, port, patience_s, complained)
     return off
 
 

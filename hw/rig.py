@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Self
 
 from hw.clock import Clock, Elapsed, Timebase, side_by_side
-from hw.errors import DeviceFault, Refused, SwitchedOff
+from hw.errors import DeviceFault, Refused, SwitchedOff, Unplugged
 from hw.interface import Aim, Camera, Floodlight, Laser, LaserReading, Photodiode, Projector, Turntable
 from hw.rig_parts import AdcPhotodiode, GatedLaser, Mirrors, TtlFloodlight, Turning
 from hw.signals import uninterrupted
@@ -231,8 +231,9 @@ def _each(clock: Clock, steps: Sequence[Callable[[], None]]) -> list[BaseExcepti
     def attempt(step: Callable[[], None]) -> None:
         try:
             step()
-        except SwitchedOff as error:
-            log.info("making the rig safe: %s", error)  # its guard was faster, and speaks up if it fails
+        except Unplugged as error:
+            quiet = error.known or isinstance(error, SwitchedOff)  # its guard was faster, and speaks up if it fails
+            log.log(logging.INFO if quiet else logging.ERROR, "making the rig safe: %s", error)
         except Exception as error:  # noqa: BLE001 - the other devices matter more
             log.error("making the rig safe: %s", error)
         except BaseException as error:  # noqa: BLE001 - raised when the other devices are off

@@ -44,6 +44,7 @@ TROUBLE = {
     errno.ENOENT: NOT_THERE,
     errno.ENXIO: NOT_THERE,
     errno.ENODEV: NOT_THERE,
+    errno.EIO: NOT_THERE,
     errno.ELOOP: NOT_THERE,
     errno.EACCES: FORBIDDEN,
     errno.EPERM: FORBIDDEN,
@@ -99,6 +100,7 @@ class Link:
     def __init__(self, url: str, baud: int, device: str, clock: Clock, log: ByteLog | None = None) -> None:
         self.url, self.device, self.clock, self._log = url, device, clock, log
         self._heard = b""
+        self._gone = False
         try:
             self._port = serial.serial_for_url(
                 url, baudrate=baud, timeout=SLICE_S, write_timeout=WRITE_TIMEOUT_S, exclusive=True
@@ -113,7 +115,7 @@ class Link:
         try:
             self._port.write(data)
         except FAILURES as error:
-            raise self._lost(f"does not take bytes any more ({error})", error) from error
+            raise self._lost(f"does not take bytes any more: {_why(error)}", error) from error
         self._heard = b""
         self._note(">", data)
 
@@ -130,7 +132,7 @@ class Link:
             there = self._port.in_waiting
             data = bytes(self._port.read(max(1, there))) if there or wait else b""
         except FAILURES as error:
-            raise self._lost(f"cannot be read any more ({error})", error) from error
+            raise self._lost(f"cannot be read any more: {_why(error)}", error) from error
         if data:
             self._heard = (self._heard + data)[:HEARD_BYTES]
             self._note("<", data)
@@ -165,7 +167,19 @@ class Link:
 
     def _lost(self, what: str, error: Exception, remedy: str = REMEDY) -> Unplugged:
         kind = SwitchedOff if isinstance(error, GuardClosed) else Unplugged
-        return kind(self.url, f"the port of {self.device}", what, remedy)
+        lost = kind(self.url, f"the port of {self.device}", what, remedy)
+        lost.known, self._gone = self._gone, True
+        self._note("!", str(error).encode())
+        return lost
+
+
+def _why(error: Exception) -> str:
+    """Why an open port fails: what systems and libraries call it goes into the byte log."""
+    if isinstance(error, GuardClosed):
+        return str(error)
+    if isinstance(error, serial.SerialTimeoutException):
+        return f"none were taken in {WRITE_TIMEOUT_S:g} s"
+    return "its cable was pulled, or it lost power"
 
 
 def _trouble(error: Exception) -> tuple[str, str]:

@@ -46,6 +46,7 @@ class TrustedBoard:
             self._clock.sleep(HEARD_S)
             raise NoAnswer("board", "the mirror board", "did not confirm an open gate", "check its cable")
         if self._pattern & self._gates:
+            self.distrusted = True
             self._cut()
 
     def ask(self, question: Callable[[Board], T]) -> T:
@@ -62,8 +63,10 @@ class TrustedBoard:
         return answer
 
     def counts(self, pin: int) -> int:
-        """The converter's value at a pin."""
-        return self.ask(lambda board: board.counts(pin))
+        """The converter's value at a pin; refused where the light went out meanwhile."""
+        counts = self.ask(lambda board: board.counts(pin))
+        self._require_trust()
+        return counts
 
     # ---- TTL lines
 
@@ -82,15 +85,19 @@ class TrustedBoard:
     def require_lines(self) -> None:
         """Refuse an image during which the board was reset: gates and mirrors have moved."""
         found = self.ask(lambda board: board.lines())
+        self._require_trust()  # it was we who shut them
         if found != self._pattern:
             problem = f"has its TTL lines at {found:06b} instead of {self._pattern:06b}: it was reset"
             raise DeviceFault("board", "the mirror board", problem, "check its power supply, then repeat the command")
 
-    def open_gate(self, line: int) -> None:
-        """Open a gate, being certain that the mirrors stand where they were told to."""
+    def _require_trust(self) -> None:
         if self.distrusted:
             problem = "lost an answer while a gate was open: the lasers were switched off"
             raise DeviceFault("board", "the mirror board", problem, "check its cable, then repeat the command")
+
+    def open_gate(self, line: int) -> None:
+        """Open a gate, being certain that the mirrors stand where they were told to."""
+        self._require_trust()
         for _ in range(ATTEMPTS):
             if not self._aimed:
                 self.aim(*self._aim)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
@@ -74,10 +74,13 @@ NearbyFile = Annotated[Path, Field(strict=False), AfterValidator(_resolve)]
 """A file that must exist; relative names are relative to the folder of the TOML file that names it."""
 
 
-def load_toml(path: str | Path, schema: type[M], what: str = "a scene's TOML file") -> M:
+def load_toml(
+    path: str | Path, schema: type[M], what: str = "a scene's TOML file", others: Mapping[str, str] | None = None
+) -> M:
     """Read and validate a TOML file. Every failure is one `InputError` that names the first problem.
 
-    what: the kind of file, in words for the remedy where another one was given
+    what: the kind of file, in words for the remedy where another one was given; others: a table of another kind of
+    file, and what that file is called
     """
     path = Path(path)
     remedy = f"give the path of {what}"
@@ -106,6 +109,9 @@ def load_toml(path: str | Path, schema: type[M], what: str = "a scene's TOML fil
         raise InputError(f"is not valid TOML: {error}", file=path, remedy=remedy) from error
     if not data:
         raise InputError("is empty: it has no key", file=path, remedy=f"write it, or {remedy}")
+    for table, kind in (others or {}).items():
+        if table in data:
+            raise InputError(f"is {kind}", file=path, remedy=f"give the path of {what}")
     for key, number in _numbers(data):
         if not -(2**63) <= number < 2**63:
             remedy = "write fewer digits"

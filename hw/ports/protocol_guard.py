@@ -183,7 +183,7 @@ class Serial(SerialBase):
             try:
                 self._guard.wait(END_S)
             except subprocess.TimeoutExpired:
-                log.warning("%s: the guard is still switching off", self.port)
+                log.info("%s: the guard is still switching off", self.port)  # it says so itself
         self._host = self._guard = None
 
     def _open_host(self) -> socket.socket:

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
+from test_capture_twin import RIG
 from test_rig_safety import at_message, emulation, reset
 
+from disco_twin.assembly import keys_named
+from disco_twin.rig_commands import rig_file_of
+from disco_twin.rig_rules import load_rig_file
 from hw.clock import VirtualClock
-from hw.errors import DeviceFault, DeviceRefused, Refused
+from hw.errors import DeviceFault, DeviceRefused, Refused, SwitchedOff
 from hw.trusted_board import TrustedBoard
 
 
@@ -87,6 +92,45 @@ def test_an_answer_that_is_lost_with_a_gate_open_cuts_every_light_and_without_on
     board.open_gate(0)
     fake.lost()
     assert cuts == ["cut"]
+
+
+def test_lines_that_the_program_shut_itself_are_no_reset() -> None:
+    """An answer that came late with a gate open: what is said then is that, not the power supply's fault."""
+    board, fake, _ = trusted()
+    board.open_gate(0)
+    lines = fake.lines
+
+    def late() -> int:
+        fake.lost()
+        fake.pattern = 0
+        return lines()
+
+    fake.lines = late  # type: ignore[method-assign]
+    with pytest.raises(DeviceFault, match=r"^board: the mirror board lost an answer while a gate was open: the lasers"):
+        board.require_lines()
+    with pytest.raises(DeviceFault, match="lost an answer"):
+        board.counts(0)
+    board.switch(0, False)  # always allowed
+
+
+def test_errors_of_a_rig_that_runs_name_file_key_and_port(tmp_path: Path) -> None:
+    """Expected: rig file, key, port, cause; what the rig says of its board is of that port."""
+    url, path = "/dev/ttyACM0", tmp_path / "rig.toml"
+    path.write_text(rig_file_of(RIG, {"board": url}))
+    file = load_rig_file(path)
+    problem = DeviceFault("board", "the mirror board", "lost an answer", "none")
+    with (
+        pytest.raises(DeviceFault, match=rf"^{path}: board.port = '{url}': the mirror board lost an"),
+        keys_named(file),
+    ):
+        raise problem
+    laser = SwitchedOff("guard:///dev/ttyUSB7", "the port of laser 635 nm", "is closed", "none")
+    path.write_text(rig_file_of(RIG, {"laser0": "/dev/ttyUSB7"}))
+    with (
+        pytest.raises(SwitchedOff, match=rf"^{path}: lasers\[0\].port = '/dev/ttyUSB7': "),
+        keys_named(load_rig_file(path)),
+    ):
+        raise laser
 
 
 def test_a_reset_in_an_exposure_is_called_a_reset() -> None:

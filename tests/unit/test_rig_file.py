@@ -111,8 +111,8 @@ responsivity = [1e12, 1e12, 1e12]
         (("[0.1, 1.5]", "[0.5, 1.0]"), "lasers[0].photodiode_limits", "[0.5, 1.0]", "lower < 1 < upper"),
         (
             ("watts_per_count = ", "watts_per_count = 1e-9 #"),
-            "lasers[0].watts_per_count",
-            "1e-09",
+            "lasers[0].power_mw",
+            "10.0",
             "at least 9.775e-06",
         ),
         (("floodlight_line", "limits_u = [9, 9]\nfloodlight_line"), "board.limits_u", "[9, 9]", "lower < upper"),

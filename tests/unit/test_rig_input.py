@@ -147,8 +147,19 @@ def test_watts_per_count_in_another_unit_is_refused(
 ) -> None:
     path = rig_file(tmp_path, ("watts_per_count = ", f"watts_per_count = {watts_per_count} #"))
     said = says("rig", "probe", path)
-    assert f"lasers[0].watts_per_count = {float(watts_per_count)!r}: " in said and says_ in said
-    assert "(allowed: at least 9.775e-06, below 0.000125)" in said
+    assert "lasers[0].power_mw = 10.0: " in said and says_ in said
+    assert f"lasers[0].watts_per_count = {float(watts_per_count):.4g}" in said
+    assert "(allowed: with this power, watts_per_count at least 9.775e-06, below 0.000125)" in said
+
+
+def test_a_power_in_watts_is_not_blamed_on_the_measured_constant(tmp_path: Path, says: Says) -> None:
+    """One of the two is in another unit, and the file alone does not say which."""
+    path = rig_file(tmp_path, ("power_mw = 10.0", "power_mw = 0.01"))
+    said = says("rig", "probe", path)
+    assert said.startswith(f"{path}: lasers[0].power_mw = 0.01: does not go with lasers[0].watts_per_count = 1.955"), (
+        said
+    )
+    assert "one of the two is in another unit" in said and "power_mw in mW" in said
 
 
 def test_power_in_another_unit_is_refused_by_what_the_laser_says_of_itself(

@@ -276,3 +276,13 @@ def test_the_file_that_an_error_names_is_the_one_that_was_given(tmp_path: Path) 
     with pytest.raises(InputError) as caught:
         load_rig_file(path)
     assert str(caught.value).count("rig.toml") == 1
+
+
+def test_a_scene_given_as_the_rig_file_and_a_rig_file_as_the_scene_are_called_that(tmp_path: Path, says: Says) -> None:
+    scene, rig = tmp_path / "scene.toml", tmp_path / "rig.toml"
+    scene.write_text(SCENE)
+    rig.write_text(rig_file_of(RIG, {}))
+    assert says("rig", "probe", scene).startswith(f"{scene}: is a scene. Remedy: give the path of a rig file (docs/lab")
+    remedy = "Remedy: give the path of a scene's TOML file"
+    assert says("rig", "emulate", rig, "--ports", tmp_path / "ports") == f"{rig}: is a rig file. {remedy}"
+    assert says("capture", rig, "--out", tmp_path / "out", "--rig", scene) == f"{rig}: is a rig file. {remedy}"

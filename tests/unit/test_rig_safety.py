@@ -224,8 +224,8 @@ def test_light_is_gone_at_once_when_an_image_fails_before_a_silent_board(deaf: b
 
 
 def test_an_answer_lost_in_the_light_puts_it_out_before_anything_is_repeated() -> None:
-    emulated = emulation()
-    with pytest.raises(DeviceFault), emulated.serial_rig() as rig, gate_open(rig.lasers[0]):  # noqa: PT012 - a gate block
+    emulated, cause = emulation(), "lost an answer while a gate was open"  # and no reset
+    with pytest.raises(DeviceFault, match=cause), emulated.serial_rig() as rig, gate_open(rig.lasers[0]):  # noqa: PT012 - a gate block
         emulated.lines["board"].command_faults.append(lambda data: b"")
         begun = emulated.clock.now()
         dark = []
