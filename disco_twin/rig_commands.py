@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,9 +20,9 @@ from hw.devices.mm_ard import ADC_TOP
 from hw.devices.omicron import OmicronLaser
 from hw.devices.ophir import OphirMeter
 from hw.errors import DeviceFault, DiscoError, InputError
-from hw.rig import DARK_COUNTS, cut_light, warm_up
+from hw.rig import DARK_COUNTS, cut_light, require_darkness, warm_up
 from hw.trusted_board import TrustedBoard
-from hw.wiring import Board
+from hw.wiring import Board, Closable
 from pipeline.rig import RigConfig
 
 log = logging.getLogger(__name__)
@@ -49,12 +49,6 @@ def _try(name: str, check: Callable[[], str]) -> Finding:
         return Finding(name, True, check())
     except DiscoError as error:
         return Finding(name, False, str(error))
-
-
-class Closable(Protocol):
-    """A driver."""
-
-    def close(self) -> None: ...
 
 
 C = TypeVar("C", bound=Closable)
@@ -260,11 +254,12 @@ def _test_lines(file: DevicesFile, board: Board) -> str:
 
 
 def _test_dark(file: DevicesFile, board: Board) -> str:
-    counts = [board.counts(laser.photodiode_pin) for laser in file.lasers]
-    if max(counts) > DARK_COUNTS:
-        problem = f"reads {max(counts)} counts with every gate shut (allowed: {DARK_COUNTS})"
-        raise DeviceFault("board", "the photodiode", problem, "shade it, or correct its amplifier's offset")
-    return f"{', '.join(map(str, counts))} counts"
+    seen = []
+    for laser in file.lasers:
+        seen.append(board.counts(laser.photodiode_pin))
+        name, remedy = f"laser {laser.wavelength_nm:g} nm", "shade it, or correct its amplifier's offset"
+        require_darkness(seen[-1], laser.photodiode_pin, name, "with every gate shut", remedy)
+    return f"{', '.join(map(str, seen))} counts"
 
 
 def _test_off(connect: Connector, index: int) -> str:
@@ -287,7 +282,7 @@ def _test_laser(connect: Connector, board: Board, index: int) -> str:
         head.emit()
         warm_up(connect.clock, file.warm_up_s, [head])
         own = head.require_power(file.power_tolerance)
-        _require_dark(trusted, wiring, head.name, "emits behind its shut gate", "see that its gate shuts")
+        _require_dark(trusted, wiring, head.name, "while it emits behind its shut gate", "see that its gate shuts")
         head.require_guard()
         trusted.open_gate(wiring.gate_line)
         seen = _through_gate(trusted, wiring, head.name, own)
@@ -297,7 +292,7 @@ def _test_laser(connect: Connector, board: Board, index: int) -> str:
         head.stop_emission()
         head.require_off()
         trusted.open_gate(wiring.gate_line)
-        _require_dark(trusted, wiring, head.name, "is off", "check the wiring of gate and interlock")
+        _require_dark(trusted, wiring, head.name, "while it is off", "check the wiring of gate and interlock")
         return (
             f"set {wiring.power_mw:g} mW, own reading {own:.2f} mW, photodiode {seen:.2f} mW ({counts} counts)"
             f"{metered}; off again"
@@ -309,12 +304,10 @@ def _meter_says(watts: float, counts: int) -> str:
     return f", power meter {1e3 * watts:.2f} mW: watts_per_count = {watts / max(counts, 1):.4g}"
 
 
-def _require_dark(board: TrustedBoard, wiring: LaserDevice, name: str, state: str, remedy: str) -> None:
+def _require_dark(board: TrustedBoard, wiring: LaserDevice, name: str, when: str, remedy: str) -> None:
     counts = board.counts(wiring.photodiode_pin)
     board.require_lines()
-    if counts > DARK_COUNTS:
-        problem = f"{state}, and its photodiode reads {counts} counts (allowed: {DARK_COUNTS})"
-        raise DeviceFault(f"pin {wiring.photodiode_pin}", name, problem, remedy)
+    require_darkness(counts, wiring.photodiode_pin, name, when, remedy)
 
 
 def _through_gate(board: TrustedBoard, wiring: LaserDevice, name: str, own_mw: float) -> float:

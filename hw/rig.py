@@ -172,10 +172,8 @@ class SerialRig:
         for head, wiring in zip(self.devices().heads, self.wiring, strict=True):
             own_mw = head.require_power(self._power_tolerance)
             counts = self.board().counts(wiring.pin)
-            if counts > DARK_COUNTS:
-                problem = f"reads {counts} counts with every gate shut (allowed: {DARK_COUNTS})"
-                remedy = f"see that the gate of {head.name} shuts, shade the photodiode, or correct its offset"
-                raise DeviceFault(f"pin {wiring.pin}", f"the photodiode of {head.name}", problem, remedy)
+            remedy = f"see that the gate of {head.name} shuts, shade the photodiode, or correct its offset"
+            require_darkness(counts, wiring.pin, head.name, "with every gate shut", remedy)
             readings.append(LaserReading(1e-3 * wiring.power_mw, 1e-3 * own_mw, counts * wiring.watts_per_count))
         return readings
 
@@ -241,3 +239,10 @@ def _each(clock: Clock, steps: Sequence[Callable[[], None]]) -> list[BaseExcepti
 
     side_by_side(clock, [partial(attempt, step) for step in steps])
     return interruptions
+
+
+def require_darkness(counts: int, pin: int, laser: str, when: str, remedy: str) -> None:
+    """Refuse a photodiode's reading that is not dark. laser: whose photodiode; when: why it should be."""
+    if counts > DARK_COUNTS:
+        problem = f"reads {counts} counts {when} (allowed: {DARK_COUNTS})"
+        raise DeviceFault(f"pin {pin}", f"the photodiode of {laser}", problem, remedy)

@@ -188,7 +188,7 @@ def test_a_laser_that_says_off_and_emits_is_not_let_out(
 @pytest.mark.parametrize(
     ("fault", "says"),
     [
-        ("leaks", "emits behind its shut gate, and its photodiode reads"),
+        ("leaks", "counts while it emits behind its shut gate (allowed: 8)"),
         ("saturates", "saturates its photodiode (1023 counts"),
         ("reset", "it was reset"),
     ],

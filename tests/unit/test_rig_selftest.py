@@ -73,8 +73,19 @@ def test_a_light_that_stays_on_behind_the_gate_is_seen(devices: Bench, monkeypat
     monkeypatch.setattr(OmicronLaser, "stop_emission", lambda head: (stopped.append(True), stop(head))[1])
     monkeypatch.setattr(board, "sample", lambda pin: 300 if stopped and board.lines & GATE else sample(pin))
     found = {f.name: f for f in selftest(load_rig_file(rig), None, armed=True)}["laser 635 nm"]
-    assert not found.good and "is off, and its photodiode reads 300 counts" in found.text
+    assert not found.good and "reads 300 counts while it is off (allowed: 8)" in found.text
     assert board.lines == 0
+
+
+def test_a_photodiode_that_is_not_dark_is_named(devices: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before any laser emits: daylight, or an amplifier's offset."""
+    emulated, _, rig = devices
+    monkeypatch.setattr(emulated.bench.board, "sample", lambda pin: 9)
+    found = {f.name: f for f in selftest(load_rig_file(rig), None, armed=False)}["photodiode, dark"]
+    assert not found.good
+    assert "pin 0: the photodiode of laser 635 nm reads 9 counts with every gate shut (allowed: 8)" in found.text
+    monkeypatch.setattr(emulated.bench.board, "sample", lambda pin: 8)
+    assert {f.name: f for f in selftest(load_rig_file(rig), None, armed=False)}["photodiode, dark"].good
 
 
 def test_a_guard_that_ends_in_the_warm_up_ends_it(devices: Bench) -> None:
