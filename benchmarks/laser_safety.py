@@ -2,8 +2,9 @@
 
 Every trial is a capture by a program of its own, with the real drivers and guards, through pseudo-terminals, in real
 time, that ends by one of the events: connecting to a laser that somebody left on; the end of the program; an exception;
-SIGINT, SIGTERM, SIGHUP; SIGKILL. The emission of all three lasers is sampled every millisecond. Waits that have nothing
-to do with switching off (the start of emission, the boot of the board) are shortened.
+SIGINT, SIGTERM, SIGHUP, SIGQUIT; SIGKILL; the end of the program with a signal on its heels (`closing`). The emission
+of all three lasers is sampled every millisecond. Waits that have nothing to do with switching off (the start of
+emission, the boot of the board) are shortened.
 """
 
 from __future__ import annotations
@@ -49,8 +50,10 @@ LANES = 2
 LIMIT_S = 0.1
 GIVEN_UP_S = 3.0
 START_S = 60.0
-SIGNALS = {"SIGINT": signal.SIGINT, "SIGTERM": signal.SIGTERM, "SIGHUP": signal.SIGHUP, "SIGKILL": signal.SIGKILL}
-EVENTS = ("connect", "exit", "exception", *SIGNALS)
+CLOSING_S = 0.1  # within it comes the signal after a normal end; closing the rig takes 0.25 s
+SIGNALS = {name: signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGKILL")}
+EVENTS = ("connect", "exit", "exception", "closing", *SIGNALS)
+EACH = 22  # trials
 RIG = RigConfig(cameras=(CameraConfig(name="front", position_mm=(450, 60, 100), width=16, height=16),))
 PLAN = Plan(("front",), (0.0,), tuple(Aim(0, 1800 + k, 2000) for k in range(400)), lasers=3)
 
@@ -72,7 +75,7 @@ class Blink:
         self.left -= 1
         if self.left == 0:
             self.told.send(time.monotonic())
-            if self.how == "exit":
+            if self.how in ("exit", "closing"):
                 sys.exit(0)
             if self.how == "exception":
                 raise RuntimeError("the benchmark's exception")
@@ -81,7 +84,7 @@ class Blink:
 
 def program(rig_toml: Path, folder: Path, how: str, images: int, told: Connection) -> None:
     """A capture; says when it is under way (or, if it ends itself, when it does)."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     sys.stderr = open(os.devnull, "w")  # noqa: SIM115 - its tracebacks are expected
     board_driver.BOOT_S = 0.05
@@ -182,6 +185,9 @@ def _captured(context: Any, emulation: Emulation, folder: Path, event: str, numb
                 return None
             happened = time.monotonic()
             os.kill(child.pid, SIGNALS[event])
+        elif event == "closing":
+            time.sleep(float(random.uniform(0, CLOSING_S)))
+            os.kill(child.pid, int(random.choice([SIGNALS[name] for name in SIGNALS if name != "SIGKILL"])))
         return _until_dark(watch, happened)
     finally:
         _ended(child)
@@ -233,8 +239,8 @@ def _ended(child: BaseProcess) -> None:
 
 
 def run(quick: bool) -> dict[str, Any]:
-    """Two hundred and three trials, 29 of each event; two of each if quick."""
-    count = len(EVENTS) * (2 if quick else 29)
+    """198 trials, 22 of each event; two of each if quick."""
+    count = len(EVENTS) * (2 if quick else EACH)
     lanes = [range(lane, count, LANES) for lane in range(LANES)]
     with ProcessPoolExecutor(LANES, mp_context=multiprocessing.get_context("spawn")) as pool:
         seen = list(pool.map(watched, lanes))
