@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 
 from hw.errors import InputError
-from hw.signals import interruptible
+from hw.signals import heed, interruptible
 from pipeline.capture.loop import Interrupted
 
 if TYPE_CHECKING:
@@ -91,11 +91,10 @@ def _loaded(path: Path, scene: Path | None) -> tuple[DevicesFile, RigConfig | No
 def _show(findings: Generator[Finding, None, None]) -> None:
     """Print them as they come. Whatever ends that, a signal or a closed pipe, what they use is made safe first."""
     good, count = True, 0
-    with interruptible() as interruption, closing(findings):
+    with interruptible(), closing(findings):
         try:
             for finding in findings:
-                if interruption.stopped:  # and a device's failure on the way out hid it
-                    raise KeyboardInterrupt
+                heed()  # where a device's failure on the way out hid it
                 console.print(str(finding), highlight=False, markup=False, soft_wrap=True)
                 good, count = good and finding.good, count + 1
         except KeyboardInterrupt:

@@ -17,7 +17,7 @@ from hw.clock import Clock, Elapsed, Timebase, side_by_side
 from hw.errors import DeviceFault, Refused, SwitchedOff, Unplugged
 from hw.interface import Aim, Camera, Floodlight, Laser, LaserReading, Photodiode, Projector, Turntable
 from hw.rig_parts import AdcPhotodiode, GatedLaser, Mirrors, TtlFloodlight, Turning
-from hw.signals import uninterrupted
+from hw.signals import heed, uninterrupted
 from hw.trusted_board import HEARD_S, TrustedBoard
 from hw.wiring import Board, Closable, Devices, Head, LaserWiring
 
@@ -198,11 +198,12 @@ class SerialRig:
 
 
 def warm_up(clock: Clock, seconds: float, heads: Sequence[Head]) -> None:
-    """Wait while lasers that emit become steady, and end at once where the guard of one ends."""
+    """Wait while lasers that emit become steady, and end at once where the guard of one ends, or the program is to."""
     left = seconds
     while left > 0:
         clock.sleep(min(left, GUARDS_EVERY_S))
         left -= GUARDS_EVERY_S
+        heed()
         for head in heads:
             head.require_guard()
 

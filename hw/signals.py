@@ -17,7 +17,7 @@ from types import FrameType
 ENDING = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT})
 
 
-@dataclass
+@dataclass(eq=False)
 class Interruption:
     """`stopped`: the program was told to end. Once `ignoring`, nothing interrupts any more."""
 
@@ -31,35 +31,79 @@ class Interruption:
             raise KeyboardInterrupt
 
 
+_heeded: list[Interruption] = []  # of the blocks that the program is in
+
+
 @contextmanager
 def interruptible() -> Iterator[Interruption]:
     """A block in which the first ending signal, whichever it is, is a KeyboardInterrupt, and the others are nothing."""
     interruption = Interruption()
-    with _handled_by(interruption.handle):
-        yield interruption
+    caught: list[KeyboardInterrupt] = []
+    try:
+        with _handled_by(interruption.handle, caught):
+            if caught:
+                raise caught[0]
+            _heeded.append(interruption)
+            yield interruption
+    finally:
+        if interruption in _heeded:
+            _heeded.remove(interruption)
+        if caught:
+            raise caught[0]
+
+
+def heed() -> None:
+    """Interrupt once more where that was lost: Python swallows what is raised in a `__del__` or a weakref's callback.
+
+    To be said before each thing that takes long or lets light out.
+    """
+    if threading.current_thread() is threading.main_thread() and any(block.stopped for block in _heeded):
+        raise KeyboardInterrupt
 
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
     """A block that no ending signal interrupts; one that arrives in it counts at its end."""
     seen: list[int] = []
+    caught: list[KeyboardInterrupt] = []
     try:
-        with _handled_by(lambda number, frame: seen.append(number)):
+        with _handled_by(lambda number, frame: seen.append(number), caught):
             yield
     finally:
         for number in seen:
             signal.raise_signal(number)
+        if caught:
+            raise caught[0]
 
 
 @contextmanager
-def _handled_by(handle: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    before = {}
-    if threading.current_thread() is threading.main_thread():
-        for number in ENDING:
-            if signal.getsignal(number) not in (signal.SIG_IGN, None):
-                before[number] = signal.signal(number, handle)
+def _handled_by(handle: Callable[[int, FrameType | None], None], caught: list[KeyboardInterrupt]) -> Iterator[None]:
+    """Replace the handlers, and put them back. What interrupts either is kept in `caught` until all of them are."""
+    before: dict[int, Callable[[int, FrameType | None], object] | int] = {}
+
+    def replace() -> None:
+        for number in sorted(ENDING, key=lambda n: n != signal.SIGINT):  # Ctrl-C, which comes twice, first
+            found = signal.getsignal(number)
+            if found not in (signal.SIG_IGN, None):
+                before.setdefault(number, found)
+                signal.signal(number, handle)
+
+    def restore() -> None:
+        for number in reversed(before):  # and last
+            signal.signal(number, before[number])
+
     try:
+        if threading.current_thread() is threading.main_thread():
+            _insist(replace, caught)
         yield
     finally:
-        for number in sorted(before, key=lambda n: n == signal.SIGINT):  # Ctrl-C, which comes twice, last
-            signal.signal(number, before[number])
+        _insist(restore, caught)
+
+
+def _insist(step: Callable[[], None], caught: list[KeyboardInterrupt]) -> None:
+    """Take a step that may be taken twice, again after what interrupts it."""
+    while True:
+        try:
+            return step()
+        except KeyboardInterrupt as error:
+            caught.append(error)

@@ -85,8 +85,8 @@ def load_toml(
     path = Path(path)
     remedy = f"give the path of {what}"
     try:
-        if path.is_char_device():  # reading it may wait for ever
-            raise InputError("is a device, not a file", file=path, remedy=remedy)
+        if path.exists() and not (path.is_file() or path.is_dir()):  # reading it may wait for ever
+            raise InputError("is a device or a pipe, not a file", file=path, remedy=remedy)
         data = tomllib.loads(path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
     except FileNotFoundError:
         near = difflib.get_close_matches(path.name, (p.name for p in path.parent.glob("*.toml")), 1)

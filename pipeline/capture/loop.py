@@ -15,7 +15,7 @@ from pathlib import Path
 from hw.errors import DiscoError, InputError
 from hw.interface import Floodlight, Rig, gate_open
 from hw.record import RawImage, Sensor
-from hw.signals import interruptible, uninterrupted
+from hw.signals import heed, interruptible, uninterrupted
 from pipeline.capture.lasers import DRIFT_SHARE, append_lasers, drifts, read_lasers
 from pipeline.capture.layout import ImageMeta
 from pipeline.capture.plan import ImageAddress, Plan
@@ -90,6 +90,7 @@ def _sweep(rig: Rig, stream: StreamWriter, progress: Progress | None) -> None:
     plan = stream.plan
     announced = checked = None
     for index in range(len(stream), len(plan)):
+        heed()
         address = plan.address(index)
         if checked != address.view:
             _check_lasers(rig, stream, address.view)
@@ -99,6 +100,7 @@ def _sweep(rig: Rig, stream: StreamWriter, progress: Progress | None) -> None:
         if address.kind == "spot" and announced != address.view:
             rig.announce([plan.spots[i] for i in plan.spots_at(plan.angle_of(address.view))])
             announced = address.view
+            heed()
         image = _take(rig, plan, address)
         with uninterrupted():
             stream.append(address, *image)
@@ -124,6 +126,7 @@ def _restore(rig: Rig, stream: StreamWriter, sensor: Sensor | None) -> None:
     if sensor is not None:
         with StreamReader(stream.folder) as stored:
             require_unmoved(rig, stored, sensor)
+    heed()
     rig.turntable.move(meta.angle_rad)
     # After a silhouette the mirrors still stand where the last spot of the view before it left them.
     backwards = (stream.plan.address(i).spot for i in range(len(stream) - 1, -1, -1))

@@ -162,6 +162,41 @@ def test_a_signal_while_the_rig_works_ahead_is_obeyed_at_once(tmp_path: Path) ->
         capture(Slow(PLAN), PLAN, tmp_path)
 
 
+class Lost:
+    """A signal at the moment in which Python swallows what is raised."""
+
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+
+def lost(*_: object) -> None:
+    Lost()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize(("moment", "images"), [("exposure", 6), ("announcement", 1), ("restoring", 6)])
+def test_a_signal_that_python_lost_still_stops_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str, images: int
+) -> None:
+    """Expected: after the image in progress, and before another thing moves or is lit; not deaf till the end."""
+    rig = FakeRig(PLAN)
+    if moment == "exposure":
+        rig.on_expose = after(5, lost)
+    elif moment == "announcement":
+        monkeypatch.setattr(rig, "announce", lost)
+    else:
+        with pytest.raises(RuntimeError):
+            capture(FakeRig(PLAN, on_expose=after(6, raise_error)), PLAN, tmp_path)
+        monkeypatch.setattr(rig.turntable, "move", lambda angle: pytest.fail("moved"))
+        monkeypatch.setattr(StreamWriter, "last_meta", lambda self: (lost(), last_meta(self))[1])
+    with pytest.raises(Interrupted, match=f"stopped: {images} of 48"):
+        capture(rig, PLAN, tmp_path)
+    assert rig.dark and rig.made_safe and rig.exposures == {"exposure": 6, "announcement": 1, "restoring": 0}[moment]
+
+
+last_meta = StreamWriter.last_meta
+
+
 def test_a_device_that_fails_on_the_way_out_does_not_hide_the_signal(tmp_path: Path) -> None:
     """The guard of a laser closes its port at the signal, and then nobody can talk to the laser any more."""
 

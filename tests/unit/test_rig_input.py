@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -36,13 +37,15 @@ def test_what_is_no_rig_file_says_so_and_where_one_is_shown(tmp_path: Path, says
     (tmp_path / "empty").write_text("\n# nothing\n")
     (tmp_path / "latin").write_bytes("format_version = 1 # für".encode("latin-1"))
     (tmp_path / "utf16").write_bytes("format_version = 1".encode("utf-16"))
+    os.mkfifo(tmp_path / "pipe")  # nobody writes into it: it would be waited for
     for name, problem in (
         ("none.toml", "no such file"),
         ("empty", "is empty"),
         ("latin", r"is not UTF-8 text \(byte 22\)"),
         ("utf16", r"is not UTF-8 text \(byte 0\)"),
         (".", "is a folder, not a file"),
-        ("/dev/null", "is a device, not a file"),
+        ("/dev/null", "is a device or a pipe, not a file"),
+        ("pipe", "is a device or a pipe, not a file"),
     ):
         path = tmp_path / name
         assert re.fullmatch(f"{re.escape(str(path))}: {problem}{remedy}", says("rig", "probe", path))
