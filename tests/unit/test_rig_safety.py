@@ -22,7 +22,6 @@ from hw.devices.omicron import OmicronLaser
 from hw.errors import DeviceFault, DiscoError, Refused, SwitchedOff, Unplugged
 from hw.interface import gate_open
 from hw.rig import SerialRig
-from hw.signals import interruptible
 from pipeline.capture.loop import capture
 
 SENSOR = lars3_sensor(RIG)
@@ -376,25 +375,6 @@ def test_a_guard_that_ends_while_lasers_warm_up_ends_it_at_once(monkeypatch: pyt
     with pytest.raises(SwitchedOff), rig:
         pass
     assert emulated.clock.now() - begun < 110
-    assert emulated.bench.light() == [] and not any(head.on_since for head in emulated.bench.heads)
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_signal_that_python_lost_ends_the_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Python swallows what is raised in a `__del__`."""
-
-    class Lost:
-        def __del__(self) -> None:
-            signal.raise_signal(signal.SIGTERM)
-
-    emulated = emulation()
-    rig = emulated.serial_rig()
-    rig._warm_up_s = 3600.0
-    begun, emit = emulated.clock.now(), OmicronLaser.emit
-    monkeypatch.setattr(OmicronLaser, "emit", lambda head: (emit(head), Lost())[0])
-    with interruptible(), pytest.raises(KeyboardInterrupt), rig:
-        pass
-    assert emulated.clock.now() - begun < 60
     assert emulated.bench.light() == [] and not any(head.on_since for head in emulated.bench.heads)
 
 

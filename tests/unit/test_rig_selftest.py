@@ -12,11 +12,13 @@ import time
 import pytest
 from guard_fakes import guards_of
 from test_rig_ending import GATE, Bench, devices, started
+from test_rig_safety import emulation
 
 from disco_twin.assembly import Connector
 from disco_twin.rig_commands import selftest
 from disco_twin.rig_rules import load_rig_file
 from hw.devices.omicron import OmicronLaser
+from hw.signals import interruptible
 
 __all__ = ["devices"]
 
@@ -107,3 +109,22 @@ def test_a_guard_that_ends_in_the_warm_up_ends_it(devices: Bench) -> None:
     out, err = process.communicate(timeout=40)
     assert time.monotonic() - begun < 20.0 and head.on_since is None
     assert process.returncode == 1 and "FAIL" in out and "Traceback" not in err, out + err
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_signal_that_python_lost_ends_the_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python swallows what is raised in a `__del__`."""
+
+    class Lost:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGTERM)
+
+    emulated = emulation()
+    rig = emulated.serial_rig()
+    rig._warm_up_s = 3600.0
+    begun, emit = emulated.clock.now(), OmicronLaser.emit
+    monkeypatch.setattr(OmicronLaser, "emit", lambda head: (emit(head), Lost())[0])
+    with interruptible(), pytest.raises(KeyboardInterrupt), rig:
+        pass
+    assert emulated.clock.now() - begun < 60
+    assert emulated.bench.light() == [] and not any(head.on_since for head in emulated.bench.heads)
