@@ -9,7 +9,9 @@ def main() -> None:
     """`disco-twin`."""
     try:
         from disco_twin.cli import main as command
+        from hw.signals import end_when_told
 
+        end_when_told()
         command()
     except KeyboardInterrupt:
         sys.stderr.write("disco-twin: stopped; the same command continues\n")

@@ -28,9 +28,19 @@ class Interruption:
         """The first one interrupts; what follows is the end, and nothing interrupts that."""
         if not self.ignoring:
             self.ignoring = self.stopped = True
+            _program.over = _program.ends
             raise KeyboardInterrupt
 
 
+@dataclass
+class _Program:
+    """`ends`: it does so when it is told to. `over`: it was, and from the end of that block on ignores all signals."""
+
+    ends: bool = False
+    over: bool = False
+
+
+_program = _Program()
 _heeded: list[Interruption] = []  # of the blocks that the program is in
 
 
@@ -50,6 +60,16 @@ def interruptible() -> Iterator[Interruption]:
             _heeded.remove(interruption)
         if caught:
             raise caught[0]
+
+
+def end_when_told() -> None:
+    """Said by a program that ends with the first `interruptible` block that is interrupted.
+
+    The signals that follow are nothing then until it has ended, also while Python puts itself away, where a handler
+    would be gone: with what was made safe and said, its exit status is that of the first. A script is not told so: it
+    may go on, and be interrupted again.
+    """
+    _program.ends = True
 
 
 def heed() -> None:
@@ -90,7 +110,7 @@ def _handled_by(handle: Callable[[int, FrameType | None], None], caught: list[Ke
 
     def restore() -> None:
         for number in reversed(before):  # and last
-            signal.signal(number, before[number])
+            signal.signal(number, signal.SIG_IGN if _program.over else before[number])
 
     try:
         if threading.current_thread() is threading.main_thread():
