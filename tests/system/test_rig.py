@@ -195,7 +195,7 @@ def test_a_guard_that_is_killed_in_the_middle_of_a_scan(rig: Path, camera: Any, 
     scene, out = tmp_path / "scene.toml", tmp_path / "out"
     change(rig, *TOO_NOISY_TO_TELL)
     process = begun(rig, tmp_path)
-    listed = ["ps", "-o", "pid=,args=", "--ppid", str(process.pid)]
+    listed = ["ps", "-ww", "-o", "pid=,args=", "--ppid", str(process.pid)]
     children = subprocess.run(listed, capture_output=True, text=True, check=True).stdout.splitlines()
     (guard,) = [int(line.split()[0]) for line in children if "hw.guard" in line]
     os.kill(guard, signal.SIGKILL)

@@ -202,6 +202,6 @@ def link(laser: Laser) -> Iterator[Link]:
 
 def guards_of(pid: int | None = None, port: str = "") -> list[int]:
     """The guards that a program has started, or all of a port."""
-    found = subprocess.run(["ps", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True)
+    found = subprocess.run(["ps", "-ww", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True)
     lines = [line.split() for line in found.stdout.splitlines() if f"-m hw.guard {port}" in line]
     return [int(own) for own, parent, *words in lines if pid in (None, int(parent)) and port in ("", *words)]
