@@ -53,7 +53,7 @@ START_S = 60.0
 CLOSING_S = 0.1  # within it comes the signal after a normal end; closing the rig takes 0.25 s
 SIGNALS = {name: signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGKILL")}
 EVENTS = ("connect", "exit", "exception", "closing", *SIGNALS)
-EACH = 22  # trials
+EACH = 23  # trials
 RIG = RigConfig(cameras=(CameraConfig(name="front", position_mm=(450, 60, 100), width=16, height=16),))
 PLAN = Plan(("front",), (0.0,), tuple(Aim(0, 1800 + k, 2000) for k in range(400)), lasers=3)
 
@@ -239,7 +239,7 @@ def _ended(child: BaseProcess) -> None:
 
 
 def run(quick: bool) -> dict[str, Any]:
-    """198 trials, 22 of each event; two of each if quick."""
+    """207 trials, 23 of each event; two of each if quick."""
     count = len(EVENTS) * (2 if quick else EACH)
     lanes = [range(lane, count, LANES) for lane in range(LANES)]
     with ProcessPoolExecutor(LANES, mp_context=multiprocessing.get_context("spawn")) as pool:
