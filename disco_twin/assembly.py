@@ -28,7 +28,7 @@ from hw.devices.ophir import OphirMeter
 from hw.devices.turning import Table
 from hw.devices.zaber import BAUD as ZABER_BAUD
 from hw.devices.zaber import ZaberTable
-from hw.errors import DeviceError, DeviceFault, DiscoError, InputError
+from hw.errors import DeviceError, DeviceFault, InputError
 from hw.interface import Camera
 from hw.ports.protocol_guard import PREFIX
 from hw.rig import SerialRig, close_all
@@ -164,12 +164,12 @@ class Connector:
         """
         boards: list[Board] = []
         heads: list[OmicronLaser] = []
-        failed: list[DiscoError] = []
+        failed: list[Exception] = []
 
         def attempt(step: Callable[[], T], into: list[T]) -> None:
             try:
                 into.append(step())
-            except DiscoError as error:
+            except Exception as error:  # noqa: BLE001 - also one that nobody foresaw: raised when everything is dark
                 failed.append(error)
 
         try:

@@ -72,6 +72,25 @@ def test_a_board_that_fails_leaves_no_laser_on(tmp_path: Path) -> None:
     assert not any(head.on_since for head in emulated.bench.heads)
 
 
+def test_a_fault_that_nobody_foresaw_leaves_nothing_else_lit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bug in the first laser's driver. Expected: the other lasers are off all the same, and it is raised."""
+    emulated = left_on()
+    connect = connector(emulated, tmp_path)
+    real, seen = OmicronLaser._identify, list[OmicronLaser]()
+
+    def broken(self: OmicronLaser, wavelength_nm: float) -> object:
+        seen.append(self)
+        if len(seen) == 1:
+            raise KeyError("a bug")
+        return real(self, wavelength_nm)
+
+    monkeypatch.setattr(OmicronLaser, "_identify", broken)
+    with pytest.raises(KeyError, match="a bug"):
+        connect.connect()
+    assert emulated.bench.board.lines == 0
+    assert not any(head.on_since for head in emulated.bench.heads[1:])
+
+
 def test_a_wrong_power_is_refused_in_the_dark(tmp_path: Path) -> None:
     """power_mw beyond what the first laser says of itself: a slip of the pen must not keep the others lit."""
     emulated = left_on()
