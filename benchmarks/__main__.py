@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pipeline.resources import measured, usable_cores
+from hw.base.resources import measured, usable_cores
 
 REGISTRY = {
     "calibrate": "benchmarks.calibrate",

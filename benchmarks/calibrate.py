@@ -24,19 +24,19 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 from disco_twin.camera.lars3 import Lars3, lars3_sensor
 from disco_twin.camera.sensor import gamma_curve
 from disco_twin.camera.targets import TargetSource
-from disco_twin.deviation import actual_rig
-from disco_twin.object.schema import Pebble
+from disco_twin.faults.actual_rig import actual_rig
 from disco_twin.object.shapes import pebble
+from disco_twin.scene.object_schema import Pebble
 from hw.record import to_radiance
 from pipeline.calibrate import pose as pose_module
-from pipeline.calibrate.camera import PinholeCamera
 from pipeline.calibrate.intrinsics import find_corners, fit_intrinsics
 from pipeline.calibrate.outline import mesh_mask, object_mask
-from pipeline.calibrate.projector import TwoMirrorProjector
 from pipeline.calibrate.projector_fit import projection, refine
 from pipeline.calibrate.response import TABLE, fit_response
-from pipeline.capture.targets import make_bracket, make_targets
-from pipeline.rig import CameraConfig, FaultsConfig, ProjectorConfig, RigConfig
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.nominal_rig import CameraConfig, FaultsConfig, ProjectorConfig, RigConfig
+from pipeline.geometry.projector import TwoMirrorProjector
+from pipeline.plan.targets import make_bracket, make_targets
 
 F64 = NDArray[np.float64]
 SEED = 5

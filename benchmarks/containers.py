@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from hw.record import RawImage
-from pipeline.capture.plan import Plan
-from pipeline.capture.stream import ImageMeta, StreamReader, StreamWriter
+from pipeline.plan.plan import Plan
+from pipeline.stream.stream import ImageMeta, StreamReader, StreamWriter
 
 Read = Callable[[int], object]
 Container = tuple[Callable[[int, RawImage], object], Callable[[], Read]]  # append an image; finish, then read one

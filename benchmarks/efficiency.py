@@ -89,8 +89,8 @@ def cameras(quick: bool) -> dict[str, Any]:
     from disco_twin.light.sources import BeamSource
     from disco_twin.light.transport import Transport
     from disco_twin.object.build import build_object
-    from disco_twin.scene import load_scene
-    from pipeline.calibrate.camera import PinholeCamera, look_at
+    from disco_twin.scene.scene import load_scene
+    from pipeline.geometry.camera import PinholeCamera, look_at
 
     transport = Transport(build_object(load_scene(SCENE, faults=False)))
     ring = []
@@ -203,7 +203,7 @@ def objects(quick: bool) -> Iterator[tuple[str, Any, Any, list[int]]]:
     from scipy import sparse
 
     from disco_twin.object.build import Boundary, Medium, TwinObject, build_object, build_scan, hat_basis
-    from disco_twin.scene import load_scene
+    from disco_twin.scene.scene import load_scene
 
     scene = load_scene(SCENE, faults=False)
     obj = build_object(scene)
@@ -272,7 +272,7 @@ def images(name: str, obj: Any, quick: bool) -> tuple[F64, list[Job]]:
     from disco_twin.light.sources import BeamSource
     from disco_twin.light.transport import Lobe, Transport
     from disco_twin.object.build import Medium, TwinObject
-    from pipeline.calibrate.camera import PinholeCamera, look_at
+    from pipeline.geometry.camera import PinholeCamera, look_at
 
     medium = obj.medium
     one = Medium(medium.sigma_t[:1], medium.albedo[:1], medium.low, medium.high, medium.g[:1])

@@ -27,16 +27,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_twin.camera.lars3 import lars3_sensor
+from disco_twin.emulation.emulated_rig import Emulation
+from disco_twin.emulation.twin_rig import TwinRig
 from disco_twin.firmware import wire
-from disco_twin.firmware.emulate import Emulation
-from disco_twin.rig import TwinRig
-from hw.clock import VirtualClock
-from hw.errors import DiscoError
+from hw.base.clock import VirtualClock
+from hw.base.errors import DiscoError
 from hw.interface import Aim
 from pipeline.capture.loop import capture
-from pipeline.capture.plan import Plan
-from pipeline.capture.stream import CorruptImage, StreamReader
-from pipeline.rig import CameraConfig, RigConfig
+from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
+from pipeline.plan.plan import Plan
+from pipeline.stream.stream import CorruptImage, StreamReader
 
 SEED = 20040814
 SIZE = (31, 48)

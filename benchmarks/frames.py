@@ -19,7 +19,7 @@ from scipy import ndimage
 from hw.interface import Aim
 
 if TYPE_CHECKING:
-    from disco_twin.world import World
+    from disco_twin.experiment.experiment import Experiment
 
 F32 = NDArray[np.float32]
 
@@ -30,7 +30,7 @@ SEED = 5
 
 
 class Interpolated:
-    """Implements `disco_twin.rig.ResponseSource`: light of `coarse`, silhouettes of `fine`."""
+    """Implements `disco_twin.emulation.twin_rig.ResponseSource`: light of `coarse`, silhouettes of `fine`."""
 
     def __init__(self, coarse: Any, fine: Any) -> None:
         self.coarse = coarse
@@ -47,17 +47,17 @@ class Interpolated:
         return np.asarray(np.maximum(light, 0.0) * (self.silhouette(camera, aim.angle) > 0), np.float32)
 
 
-def capture_frames(folder: Path, spots: int, walks: int, angles: int = 3, vertices: int | None = None) -> World:
+def capture_frames(folder: Path, spots: int, walks: int, angles: int = 3, vertices: int | None = None) -> Experiment:
     """A whole capture of `spots` spots with `walks` photons each, into `folder / "capture"`; its world.
 
     angles: of the turntable, evenly spaced; vertices: of the scan, about, if not the scene's
     """
-    from disco_twin.deviation import actual_rig
-    from disco_twin.rig import TwinRig
-    from disco_twin.scene import load_scene
-    from disco_twin.world import World
+    from disco_twin.emulation.twin_rig import TwinRig
+    from disco_twin.experiment.experiment import Experiment
+    from disco_twin.faults.actual_rig import actual_rig
+    from disco_twin.scene.scene import load_scene
     from pipeline.capture.loop import capture
-    from pipeline.rig import RigConfig
+    from pipeline.geometry.nominal_rig import RigConfig
 
     scene = load_scene(SCENE, faults=False)
     lit = {"warm_up": True, "blue_noise": True, "mode_hop": True, "speckle": True, "flare": True}
@@ -71,8 +71,8 @@ def capture_frames(folder: Path, spots: int, walks: int, angles: int = 3, vertic
         return scene.rig.model_copy(update=update)
 
     scan = scene.scan.model_copy(update={"vertices": vertices or scene.scan.vertices})
-    world = World(scene.model_copy(update={"rig": rig(1), "scan": scan}))
-    transport = world.transport
+    experiment = Experiment(scene.model_copy(update={"rig": rig(1), "scan": scan}))
+    transport = experiment.transport
     from disco_twin.light.response import SpotResponses
 
     def responses(factor: int) -> SpotResponses:
@@ -81,5 +81,5 @@ def capture_frames(folder: Path, spots: int, walks: int, angles: int = 3, vertic
         )
 
     twin = TwinRig(rig(1), Interpolated(responses(FACTOR), responses(1)), scene.seed)
-    capture(twin, world.plan, folder / "capture")
-    return world
+    capture(twin, experiment.plan, folder / "capture")
+    return experiment

@@ -29,21 +29,21 @@ import numpy as np
 
 import disco_twin.firmware.omicron as omicron_firmware
 import hw.devices.mm_ard as board_driver
-from disco_twin.assembly import Connector, free_line, wiring_of
-from disco_twin.firmware.emulate import Emulation
-from disco_twin.firmware.serve import Server
-from disco_twin.rig_commands import rig_file_of
-from disco_twin.rig_rules import load_rig_file
-from disco_twin.rig_served import emulated_devices
-from hw.clock import WallClock
+from disco_twin.emulation.connect import Connector, free_line, wiring_of
+from disco_twin.emulation.emulated_rig import Emulation
+from disco_twin.emulation.rig_rules import load_rig_file
+from disco_twin.emulation.selftest import rig_file_of
+from disco_twin.emulation.serve import Server
+from disco_twin.emulation.served_rig import emulated_devices
+from hw.base.clock import WallClock
 from hw.devices.omicron_protocol import Mode
 from hw.interface import Aim
 from hw.record import RawImage
-from hw.rig import SerialRig
-from hw.serial_link import Link
+from hw.rig.serial_rig import SerialRig
+from hw.serial.link import Link
 from pipeline.capture.loop import capture
-from pipeline.capture.plan import Plan
-from pipeline.rig import CameraConfig, RigConfig
+from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
+from pipeline.plan.plan import Plan
 
 SEED = 635532476
 LANES = 2

@@ -22,13 +22,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks.frames import capture_frames
+from hw.base.resources import usable_cores
 from hw.interface import Aim
 from pipeline.calibrate.calibration import nominal_calibration
-from pipeline.capture.plan import Plan
-from pipeline.capture.stream import StreamReader, StreamWriter
-from pipeline.reconstruct.resample import Part, Sight, resample
-from pipeline.reconstruct.views import footprint_reading
-from pipeline.resources import usable_cores
+from pipeline.plan.plan import Plan
+from pipeline.reconstruct.samples.image_operators import footprint_reading
+from pipeline.reconstruct.samples.resample import BatchResult, ViewReader, resample
+from pipeline.stream.stream import StreamReader, StreamWriter
 
 MAX_VIEW_DEG = 75.0
 ETA = 1.3
@@ -50,7 +50,7 @@ def run(quick: bool = False) -> dict[str, Any]:
             camera = calibration.view_camera(view)
             readings.append({"footprint": footprint_reading(mesh, camera, ETA, MAX_VIEW_DEG)})
         cpu = (time.process_time() - cpu) / plan.views
-        sights = [Sight.of(view, calibration, mesh, readings[view]) for view in range(plan.views)]
+        sights = [ViewReader.of(view, calibration, mesh, readings[view]) for view in range(plan.views)]
         lit = np.ones(len(plan.spots))
         figures: dict[str, list[float]] = {}
 
@@ -123,7 +123,7 @@ def plain(stream: StreamReader, calibration: Any, readings: Any, index: int) -> 
     return readings[address.view]["footprint"].operator @ image.radiance.ravel().astype(np.float64) * scale
 
 
-def error_over_noise(part: Part, stream: StreamReader, calibration: Any, readings: Any) -> float:
+def error_over_noise(part: BatchResult, stream: StreamReader, calibration: Any, readings: Any) -> float:
     """Largest deviation of a reading from the plain one, in standard deviations of that reading."""
     sight, worst = part.task.sight, 0.0
     rows = sight.rows["footprint"]

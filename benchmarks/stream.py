@@ -22,8 +22,8 @@ import numpy as np
 from benchmarks.containers import container_rows
 from benchmarks.frames import capture_frames
 from hw.record import RawImage
-from pipeline.capture.layout import ImageMeta
-from pipeline.capture.stream import StreamReader, StreamWriter
+from pipeline.stream.layout import ImageMeta
+from pipeline.stream.stream import StreamReader, StreamWriter
 
 THREADS = 2
 LAYOUTS: dict[str, Callable[[RawImage], bytes]] = {

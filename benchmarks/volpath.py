@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_twin.object.build import TwinObject
-from pipeline.calibrate.camera import PinholeCamera
+from pipeline.geometry.camera import PinholeCamera
 from pipeline.relight.lights import Directional, Uniform
 
 DEPTH = 4000  # Russian roulette starts here, that is, never: volpath caps survival at .95 even on null collisions

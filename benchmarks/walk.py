@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 def run(quick: bool = False) -> dict[str, Any]:
     """Keys of benchmarks.md, and `curves` of error against time."""
-    from disco_twin.backend import activate
+    from disco_twin.light.backend import activate
 
     activate()
     from benchmarks.efficiency import efficiency
@@ -79,7 +79,7 @@ def walk_jobs(obj: Any, walks: int) -> dict[str, tuple[int, Callable[[int], Any]
     from disco_twin.light import splitting
     from disco_twin.light.sources import BeamSource
     from disco_twin.light.transport import Lobe, Transport
-    from pipeline.calibrate.camera import PinholeCamera, look_at
+    from pipeline.geometry.camera import PinholeCamera, look_at
 
     pose = look_at((30.0, 0.0, 400.0), (0.0, 0.0, 0.0))
     camera = PinholeCamera(64, 64, np.full(2, 600.0), np.full(2, 32.0), np.zeros(5), pose)
@@ -106,7 +106,7 @@ def volpath_job(obj: Any, spp: int, folder: Path) -> tuple[int, Callable[[int], 
     import mitsuba as mi
 
     from benchmarks.volpath import volpath_scene
-    from pipeline.calibrate.camera import PinholeCamera, look_at
+    from pipeline.geometry.camera import PinholeCamera, look_at
     from pipeline.relight.lights import Uniform
 
     pixels = 64

@@ -6,9 +6,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field
 
+from hw.base.config import Strict, as_table
 from hw.record import Sensor
-from pipeline.config import Strict, as_table
-from pipeline.rig import RigConfig
+from pipeline.geometry.nominal_rig import RigConfig
 
 
 class RigFile(Strict):

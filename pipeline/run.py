@@ -27,29 +27,29 @@ import trimesh
 from numpy.typing import NDArray
 from pydantic import Field
 
-from hw.errors import DiscoError, InputError, refused_by_the_disk
+from hw.base.config import Strict, read_json
+from hw.base.errors import DiscoError, InputError, refused_by_the_disk
+from hw.base.resources import measured
 from hw.record import Sensor
+from pipeline.calibrate.calibrate_rig import measure
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
-from pipeline.calibrate.camera import PinholeCamera
 from pipeline.calibrate.figures import figures
-from pipeline.calibrate.fresnel import Boundary
-from pipeline.calibrate.measure import measure
 from pipeline.calibrate.target_images import has_targets
-from pipeline.capture.stream import StreamReader
-from pipeline.capture.targets import FOLDER
-from pipeline.config import Strict, read_json
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.fresnel import Boundary
+from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
+from pipeline.model.reflectance import ReflectanceModel
+from pipeline.plan.targets import FOLDER
 from pipeline.reconstruct.methods import METHODS, READINGS, reconstruct
-from pipeline.reconstruct.model import ReflectanceModel
-from pipeline.reconstruct.needs import omissions
-from pipeline.reconstruct.samples import Samples, SampleStatistics, take_samples
+from pipeline.reconstruct.omissions import omissions
+from pipeline.reconstruct.samples.image_operators import ImageOperator
+from pipeline.reconstruct.samples.samples import Samples, SampleStatistics, take_samples
 from pipeline.reconstruct.settings import ReconstructConfig
-from pipeline.reconstruct.views import Reading
 from pipeline.records import RigFile, SensorFile
 from pipeline.relight.irradiance import transmitted_flux
 from pipeline.relight.lights import Light
-from pipeline.relight.relight import ViewMatrix, view_matrix
-from pipeline.resources import measured
-from pipeline.rig import CameraConfig, RigConfig
+from pipeline.relight.view_matrix import ViewMatrix, view_matrix
+from pipeline.stream.stream import StreamReader
 
 FORMAT_VERSION = 1
 CAPTURE_AGAIN = "delete it, then repeat the capture command"
@@ -132,7 +132,7 @@ def gather(
     ways = dict.fromkeys(["footprint", *(METHODS[m].reading for m in settings.methods)])
     with stages.stage("views"):
         cameras = [calibration.view_camera(v) for v in range(len(calibration.views))]
-        readings: dict[str, list[Reading]] = {
+        readings: dict[str, list[ImageOperator]] = {
             way: [READINGS[way](mesh, camera, settings.eta, settings.max_view_deg) for camera in cameras]
             for way in ways
         }

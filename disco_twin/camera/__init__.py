@@ -1,1 +1,1 @@
-"""disco_twin/camera"""
+"""The twin's camera: lens, sensor and calibration targets."""

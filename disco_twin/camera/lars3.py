@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from disco_twin.camera import sensor as steps
 from disco_twin.camera.lens import Glare, vignetting
 from hw.record import RawImage, Sensor
-from pipeline.calibrate.camera import PinholeCamera
-from pipeline.rig import RigConfig
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.nominal_rig import RigConfig
 
 PIXEL_MM = 0.011
 F_NUMBER = 4.0  # at 2.8 the peak of a 10 mW spot on a white object would saturate at the shortest exposure

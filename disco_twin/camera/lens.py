@@ -8,7 +8,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from pipeline.calibrate.camera import PinholeCamera
+from pipeline.geometry.camera import PinholeCamera
 
 F32 = NDArray[np.float32]
 

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from disco_twin.deviation import ActualRig, nudge
-from disco_twin.faults import Stream, generator
+from disco_twin.faults.actual_rig import ActualRig, nudge
+from disco_twin.faults.light_faults import Stream, generator
 from hw.interface import Aim
-from pipeline.calibrate.camera import PinholeCamera
-from pipeline.capture.targets import Targets
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.plan.targets import Targets
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -34,7 +34,7 @@ EDGE_SAMPLES = 16  # the same where an edge passes: a pixel's share of either si
 
 @dataclass
 class TargetSource:
-    """Implements `disco_twin.rig.ResponseSource` for one camera, in the world frame; beam_radius in mm."""
+    """A `ResponseSource` of the twin for one camera, in the world frame; beam_radius in mm."""
 
     targets: Targets
     camera: PinholeCamera

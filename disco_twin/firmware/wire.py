@@ -1,7 +1,7 @@
 """The line between a computer and an emulated device: baud rate, latency, and everything that goes wrong on a cable.
 
 A device's firmware is a pure state machine: bytes in, timed bytes out. `Line` lets its answers arrive when a real line
-would deliver them, and implements `hw.ports.protocol_memory.Peer`, so that drivers reach it as `memory://NAME`.
+would deliver them, and implements `hw.serial.ports.protocol_memory.Peer`, so that drivers reach it as `memory://NAME`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
-from hw.clock import Clock
+from hw.base.clock import Clock
 
 Timed = tuple[float, bytes]  # seconds from now, bytes of one message
 Fault = Callable[[bytes], list[Timed]]  # what becomes of an answer

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from hw.errors import InputError
-from pipeline.calibrate.camera import PinholeCamera
+from hw.base.errors import InputError
+from pipeline.geometry.camera import PinholeCamera
 from pipeline.relight.lights import Light
 
 if TYPE_CHECKING:

@@ -17,14 +17,14 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from disco_twin.deviation import ActualRig
+from disco_twin.faults.actual_rig import ActualRig
 from disco_twin.light.sources import BeamSource, Source
 from disco_twin.light.transport import Transport
 from disco_twin.object.build import TwinObject
-from hw.errors import refused_by_the_disk
+from hw.base.errors import refused_by_the_disk
 from hw.interface import Aim
-from pipeline.calibrate.camera import PinholeCamera
-from pipeline.rig import RigConfig
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.nominal_rig import RigConfig
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +51,7 @@ def light_key(obj: TwinObject, config: RigConfig, actual: ActualRig) -> str:
 
 
 class SpotResponses:
-    """Implements `disco_twin.rig.ResponseSource` by the photon walk.
+    """Implements `disco_twin.emulation.twin_rig.ResponseSource` by the photon walk.
 
     Each chunk of spots is one file `spots-<name>.npy` in `scratch`, (2, spots, C, L, H, W) float32: mean radiance per
     watt, and the simulation's own variance of it.

@@ -1,7 +1,7 @@
 """Random numbers and the samplers of the photon walk, as Dr.Jit functions.
 
-All of them need an active Mitsuba variant (`disco_twin.backend.activate`). Every sampler has a density beside it and
-a chi-squared test in tests/validation.
+All of them need an active Mitsuba variant (`disco_twin.light.backend.activate`). Every sampler has a density beside it
+and a chi-squared test in tests/validation.
 """
 
 from __future__ import annotations

@@ -187,7 +187,7 @@ class ProjectorSource:
     """`TexturedProjector`: uniform over the part of the slide that can reach the object's bounding sphere."""
 
     def __init__(self, light: TexturedProjector, radius: float) -> None:
-        from pipeline.calibrate.camera import look_at
+        from pipeline.geometry.camera import look_at
 
         pose = look_at(light.position_mm, light.aim_mm, light.up)
         self.distance = float(np.linalg.norm(np.subtract(light.aim_mm, light.position_mm)))

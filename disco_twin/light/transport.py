@@ -22,7 +22,7 @@ from disco_twin.light.splitting import Window
 from disco_twin.light.tables import FAR
 from disco_twin.light.walk import Balance, walk
 from disco_twin.object.build import Medium, TwinObject
-from pipeline.calibrate.camera import PinholeCamera
+from pipeline.geometry.camera import PinholeCamera
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]

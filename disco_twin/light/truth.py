@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from disco_twin.light.balance import EnergyBalance
-from hw.errors import InputError
-from pipeline.calibrate.fresnel import mean_transmittance
+from hw.base.errors import InputError
+from pipeline.geometry.fresnel import mean_transmittance
 
 if TYPE_CHECKING:
     from disco_twin.light.sources import HatSource

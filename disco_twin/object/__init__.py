@@ -1,1 +1,1 @@
-"""disco_twin/object"""
+"""The object that light is traced through: shape, medium, and its scan."""

@@ -11,10 +11,10 @@ from disco_twin.object import shapes
 from disco_twin.object.media import Medium, build_medium
 from disco_twin.object.mesh import check_size, hat_basis, read_mesh, remesh
 from disco_twin.object.scanner import scan_points
-from disco_twin.object.schema import Box, MeshFile, ObjectConfig, Pebble, Sphere, Torus
-from disco_twin.scene import MOST_VERTICES, Scene
-from hw.errors import InputError
-from pipeline.calibrate.geometry import reconstruct_surface
+from disco_twin.scene.object_schema import Box, MeshFile, ObjectConfig, Pebble, Sphere, Torus
+from disco_twin.scene.scene import MOST_VERTICES, Scene
+from hw.base.errors import InputError
+from pipeline.geometry.surface_from_points import reconstruct_surface
 
 __all__ = ["Boundary", "Medium", "TwinObject", "build_object", "build_scan", "hat_basis"]
 

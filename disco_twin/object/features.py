@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from disco_twin.object.mesh import closest, depth
-from disco_twin.object.schema import Crack, Feature, HollowCore, Layers, Patch, Veins
-from hw.errors import InputError
+from disco_twin.scene.object_schema import Crack, Feature, HollowCore, Layers, Patch, Veins
+from hw.base.errors import InputError
 
 F64 = NDArray[np.float64]
 MOST_VEINS = 1e6

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from disco_twin.object.features import coverage
 from disco_twin.object.materials import measured
-from disco_twin.object.schema import Grid, HollowCore, Homogeneous, MediumConfig
 from disco_twin.object.voxels import read_voxels
-from hw.errors import InputError
+from disco_twin.scene.object_schema import Grid, HollowCore, Homogeneous, MediumConfig
+from hw.base.errors import InputError
 
 F64 = NDArray[np.float64]
 KEY = "object.medium"

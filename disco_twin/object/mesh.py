@@ -11,7 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from disco_twin.object.shells import check_shells
-from hw.errors import InputError
+from hw.base.errors import InputError
 
 F64 = NDArray[np.float64]
 KEY = "object.shape.file"

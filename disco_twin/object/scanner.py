@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from disco_twin.faults import Stream, generator
+from disco_twin.faults.light_faults import Stream, generator
 
 F64 = NDArray[np.float64]
 

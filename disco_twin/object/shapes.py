@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from disco_twin.object.schema import Box, Pebble, Sphere, Torus
+from disco_twin.scene.object_schema import Box, Pebble, Sphere, Torus
 
 F64 = NDArray[np.float64]
 SUBDIVISIONS = 5  # of an icosahedron: 10242 vertices, 20480 triangles

@@ -9,7 +9,7 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from hw.errors import InputError
+from hw.base.errors import InputError
 
 F64 = NDArray[np.float64]
 MARGIN = 1e-4  # of an edge, or of a triangle's height: nearer to its border it is a touch, not a crossing

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hw.errors import InputError
+from hw.base.errors import InputError
 
 F64 = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from typing import TypeVar
 
 import numpy as np
 
+from hw.base.errors import DeviceFault, Garbled, NoAnswer, WrongDevice
 from hw.devices.turning import POLL_S, degrees_of, not_reached
-from hw.errors import DeviceFault, Garbled, NoAnswer, WrongDevice
-from hw.serial_link import Inbox, LineFramer, Link, persist
+from hw.serial.link import Inbox, LineFramer, Link, persist
 
 T = TypeVar("T")
 

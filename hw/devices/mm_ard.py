@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from hw.errors import DeviceRefused, Garbled, InputError, NoAnswer, WrongDevice
-from hw.serial_link import Inbox, Link, persist
-from hw.signals import uninterrupted
+from hw.base.errors import DeviceRefused, Garbled, InputError, NoAnswer, WrongDevice
+from hw.safety.signals import uninterrupted
+from hw.serial.link import Inbox, Link, persist
 
 BAUD = 57_600
 BOOT_S = 2.0  # opening the port resets the board

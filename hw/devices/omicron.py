@@ -14,10 +14,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NoReturn, TypeVar
 
+from hw.base.errors import DeviceError, DeviceFault, DeviceRefused, Garbled, NoAnswer, WrongDevice
 from hw.devices.omicron_protocol import FAULTS, LEVELS, Mode, OmicronFramer, Status
-from hw.errors import DeviceError, DeviceFault, DeviceRefused, Garbled, NoAnswer, WrongDevice
-from hw.serial_link import Inbox, Link, persist
-from hw.signals import uninterrupted
+from hw.safety.signals import uninterrupted
+from hw.serial.link import Inbox, Link, persist
 
 log = logging.getLogger(__name__)
 

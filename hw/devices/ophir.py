@@ -11,8 +11,8 @@ import re
 from collections.abc import Callable
 from typing import TypeVar
 
-from hw.errors import DeviceFault, DeviceRefused, Garbled, NoAnswer, WrongDevice
-from hw.serial_link import Inbox, LineFramer, Link, persist
+from hw.base.errors import DeviceFault, DeviceRefused, Garbled, NoAnswer, WrongDevice
+from hw.serial.link import Inbox, LineFramer, Link, persist
 
 T = TypeVar("T")
 

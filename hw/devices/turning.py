@@ -6,8 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
-from hw.errors import NoAnswer
-from hw.serial_link import Link
+from hw.base.errors import NoAnswer
+from hw.serial.link import Link
 
 POLL_S = 0.1
 

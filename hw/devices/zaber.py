@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hw.base.errors import DeviceError, DeviceFault, DeviceRefused, Garbled, NoAnswer, WrongDevice
 from hw.devices.turning import POLL_S, degrees_of, not_reached
-from hw.errors import DeviceError, DeviceFault, DeviceRefused, Garbled, NoAnswer, WrongDevice
-from hw.serial_link import Inbox, Link, persist
+from hw.serial.link import Inbox, Link, persist
 
 log = logging.getLogger(__name__)
 

@@ -1,1 +1,1 @@
-"""pipeline/calibrate"""
+"""Poses, lenses, projector and photometry of a captured rig, from its own images."""

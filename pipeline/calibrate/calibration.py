@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from hw.errors import InputError
+from hw.base.config import Strict, as_table, check
+from hw.base.errors import InputError
 from hw.interface import Aim
 from hw.record import RadianceImage, RawImage, Sensor, to_radiance
-from pipeline.calibrate.camera import PinholeCamera, turn
-from pipeline.calibrate.projector import TwoMirrorProjector
-from pipeline.config import Strict, as_table, check
-from pipeline.rig import RigConfig
+from pipeline.geometry.camera import PinholeCamera, turn
+from pipeline.geometry.nominal_rig import RigConfig
+from pipeline.geometry.projector import TwoMirrorProjector
 
 F64 = NDArray[np.float64]
 Row = tuple[float, float, float, float]

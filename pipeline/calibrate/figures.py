@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from pipeline.calibrate.measure import Measured
+    from pipeline.calibrate.calibrate_rig import Measured
     from pipeline.calibrate.pose import PoseFit
     from pipeline.calibrate.projector_fit import ProjectorFit
     from pipeline.calibrate.target_images import CameraImages

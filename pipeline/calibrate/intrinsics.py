@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from hw.errors import DiscoError
-from pipeline.calibrate.camera import PinholeCamera
+from hw.base.errors import DiscoError
+from pipeline.geometry.camera import PinholeCamera
 
 F64 = NDArray[np.float64]
 

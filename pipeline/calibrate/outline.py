@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, special
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from pipeline.calibrate.camera import PinholeCamera
+from pipeline.geometry.camera import PinholeCamera
 
 F64 = NDArray[np.float64]
 

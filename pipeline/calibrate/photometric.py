@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.calibrate.camera import PinholeCamera
+from pipeline.geometry.camera import PinholeCamera
 
 F64 = NDArray[np.float64]
 

@@ -17,10 +17,10 @@ from scipy import ndimage
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from hw.errors import DiscoError
-from pipeline.calibrate.camera import PinholeCamera, turn
+from hw.base.errors import DiscoError
 from pipeline.calibrate.outline import Outline, edges_along, mesh_mask, object_mask, outline, signed_distance, synthetic
 from pipeline.calibrate.scan_error import surface_error
+from pipeline.geometry.camera import PinholeCamera, turn
 
 F64 = NDArray[np.float64]
 

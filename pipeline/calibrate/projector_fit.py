@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hw.errors import DiscoError
-from pipeline.calibrate.projector import TwoMirrorProjector
+from hw.base.errors import DiscoError
+from pipeline.geometry.projector import TwoMirrorProjector
 
 F64 = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from hw.errors import InputError
+from hw.base.errors import InputError
 from hw.record import Sensor
 
 F64 = NDArray[np.float64]

@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from hw.errors import DiscoError, InputError
+from hw.base.errors import DiscoError, InputError
 from hw.record import RawImage, Sensor, to_radiance
-from pipeline.calibrate.camera import PinholeCamera
 from pipeline.calibrate.intrinsics import Intrinsics, board_pose, find_corners, fit_intrinsics
 from pipeline.calibrate.peaks import find_peak, seen
 from pipeline.calibrate.photometric import Balance, balance, pixel_areas
 from pipeline.calibrate.response import Response, fit_response
-from pipeline.capture.plan import ImageAddress
-from pipeline.capture.stream import CorruptImage, StreamReader
-from pipeline.capture.targets import BRACKET, FOLDER, TARGETS, Targets
-from pipeline.rig import RigConfig
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.nominal_rig import RigConfig
+from pipeline.plan.plan import ImageAddress
+from pipeline.plan.targets import BRACKET, FOLDER, TARGETS, Targets
+from pipeline.stream.stream import CorruptImage, StreamReader
 
 F64 = NDArray[np.float64]
 

@@ -1,1 +1,1 @@
-"""pipeline/capture"""
+"""Drives a rig through a plan into a stream, and judges what was captured."""

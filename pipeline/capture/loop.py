@@ -12,15 +12,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from hw.errors import DiscoError, InputError
+from hw.base.errors import DiscoError, InputError
 from hw.interface import Floodlight, Rig, gate_open
 from hw.record import RawImage, Sensor
-from hw.signals import heed, interruptible, uninterrupted
-from pipeline.capture.lasers import DRIFT_SHARE, append_lasers, drifts, read_lasers
-from pipeline.capture.layout import ImageMeta
-from pipeline.capture.plan import ImageAddress, Plan
-from pipeline.capture.reference import require_unmoved
-from pipeline.capture.stream import StreamReader, StreamWriter
+from hw.safety.signals import interruptible, raise_if_interrupted, uninterrupted
+from pipeline.capture.laser_log import DRIFT_SHARE, append_lasers, drifts, read_lasers
+from pipeline.capture.unmoved import require_unmoved
+from pipeline.plan.plan import ImageAddress, Plan
+from pipeline.stream.layout import ImageMeta
+from pipeline.stream.stream import StreamReader, StreamWriter
 
 log = logging.getLogger(__name__)
 
@@ -49,10 +49,10 @@ def capture(
 ) -> CaptureReport:
     """Take the images of the plan that are not yet stored in the folder. The rig is safe whenever this ends.
 
-    Ctrl-C (or another signal of `hw.signals`) is obeyed at once, since lasers must go out: the image in progress is
-    dropped, to be taken again, and `Interrupted` raised. The folder of another plan is refused before the rig is
+    Ctrl-C (or another signal of `hw.safety.signals`) is obeyed at once, since lasers must go out: the image in progress
+    is dropped, to be taken again, and `Interrupted` raised. The folder of another plan is refused before the rig is
     switched on.
-    With a `sensor`, a rig that has moved since the capture was interrupted is refused (`pipeline.capture.reference`).
+    With a `sensor`, a rig that has moved since the capture was interrupted is refused (`pipeline.capture.unmoved`).
     """
     _require_match(rig, plan)
     with StreamWriter(folder, plan) as stream:
@@ -90,7 +90,7 @@ def _sweep(rig: Rig, stream: StreamWriter, progress: Progress | None) -> None:
     plan = stream.plan
     announced = checked = None
     for index in range(len(stream), len(plan)):
-        heed()
+        raise_if_interrupted()
         address = plan.address(index)
         if checked != address.view:
             _check_lasers(rig, stream, address.view)
@@ -100,7 +100,7 @@ def _sweep(rig: Rig, stream: StreamWriter, progress: Progress | None) -> None:
         if address.kind == "spot" and announced != address.view:
             rig.announce([plan.spots[i] for i in plan.spots_at(plan.angle_of(address.view))])
             announced = address.view
-            heed()
+            raise_if_interrupted()
         image = _take(rig, plan, address)
         with uninterrupted():
             stream.append(address, *image)
@@ -126,7 +126,7 @@ def _restore(rig: Rig, stream: StreamWriter, sensor: Sensor | None) -> None:
     if sensor is not None:
         with StreamReader(stream.folder) as stored:
             require_unmoved(rig, stored, sensor)
-    heed()
+    raise_if_interrupted()
     rig.turntable.move(meta.angle_rad)
     # After a silhouette the mirrors still stand where the last spot of the view before it left them.
     backwards = (stream.plan.address(i).spot for i in range(len(stream) - 1, -1, -1))

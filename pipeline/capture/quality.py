@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hw.record import Sensor, to_radiance
-from pipeline.capture.lasers import DRIFT_SHARE, drifts, read_lasers
-from pipeline.capture.stream import CorruptImage, StreamReader
+from pipeline.capture.laser_log import DRIFT_SHARE, drifts, read_lasers
+from pipeline.stream.stream import CorruptImage, StreamReader
 
 SIGNIFICANT = 5.0  # standard deviations: a pixel that shows light
 DARK_PIXELS = 20  # a spot with fewer significant pixels tells nothing

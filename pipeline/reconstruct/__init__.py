@@ -1,1 +1,1 @@
-"""pipeline/reconstruct"""
+"""Methods: from samples of R_d to a relightable model."""

@@ -8,14 +8,14 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.reconstruct.completion import complete
-from pipeline.reconstruct.dipole import fit_dipole
-from pipeline.reconstruct.disco2004 import resample_2004
-from pipeline.reconstruct.lambertian import fit_lambertian
-from pipeline.reconstruct.model import ReflectanceModel
-from pipeline.reconstruct.needs import colour_groups, is_opaque
-from pipeline.reconstruct.samples import Samples, select_lasers
-from pipeline.reconstruct.views import bilinear_reading, footprint_reading
+from pipeline.model.reflectance import ReflectanceModel
+from pipeline.reconstruct.baselines.dipole import fit_dipole
+from pipeline.reconstruct.baselines.disco2004 import resample_2004
+from pipeline.reconstruct.baselines.lambertian import fit_lambertian
+from pipeline.reconstruct.global_term.completion import complete
+from pipeline.reconstruct.omissions import colour_groups, is_opaque
+from pipeline.reconstruct.samples.image_operators import bilinear_reading, footprint_reading
+from pipeline.reconstruct.samples.samples import Samples, select_lasers
 
 READINGS = {"footprint": footprint_reading, "bilinear": bilinear_reading}
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from pipeline.config import Strict
+from hw.base.config import Strict
 
 Method = Literal["default", "disco2004", "dipole", "lambertian"]
 Degrees = Annotated[float, Field(gt=0, lt=90)]

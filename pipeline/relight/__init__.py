@@ -1,1 +1,1 @@
-"""pipeline/relight"""
+"""Lights, what they send through the surface, and images of a model under them."""

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import linalg as sparse_linalg
 
-from pipeline.calibrate.fresnel import Boundary, transmittance
-from pipeline.reconstruct.mesh import vertex_areas
-from pipeline.relight.arrival import colour, finest_mm, from_many_directions, from_one_direction
+from pipeline.geometry.fresnel import Boundary, transmittance
+from pipeline.geometry.mesh import vertex_areas
+from pipeline.geometry.shadowing import F64, Int, Surface
+from pipeline.relight.incident_light import colour, finest_mm, from_many_directions, from_one_direction
 from pipeline.relight.lights import Environment, Light, Uniform
-from pipeline.relight.surface import F64, Int, Surface
 
 if TYPE_CHECKING:
     import trimesh

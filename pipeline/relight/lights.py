@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from pipeline.config import Strict
-from pipeline.rig import Aimed, Point, Positive
+from hw.base.config import Strict
+from pipeline.geometry.nominal_rig import Aimed, Point, Positive
 
 
 def _not_zero(vector: Point) -> Point:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from disco_twin import run as run_module
-from disco_twin.cli import main
-from hw.errors import DiscoError
+from disco_twin.cli.app import main
+from disco_twin.run import stages as run_module
+from hw.base.errors import DiscoError
 from pipeline.capture.loop import Interrupted
 
 
@@ -101,7 +101,7 @@ def test_what_goes_wrong_later(
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("disco_twin.simulate.write_scan", fail)
+    monkeypatch.setattr("disco_twin.run.simulate.write_scan", fail)
     quick = str(repository / "scenes" / "quick.toml")
     found, line = status_and_line(["run", quick, "--out", str(tmp_path / "out"), "--profile", "small"], capsys)
     assert found == status

@@ -19,7 +19,8 @@ BROAD = ("uniform", "directional", "environment")
 def run(repository: Path, folder: Path, *options: str) -> dict[str, Any]:
     """summary.json of a whole run of quick.toml, with the seconds that the command took."""
     out, scene = folder / "out", repository / "scenes" / "quick.toml"
-    command = [sys.executable, "-c", "from disco_twin.cli import main; main()", "run", str(scene), "--out", str(out)]
+    command = [sys.executable, "-c", "from disco_twin.cli.app import main; main()", "run", str(scene)]
+    command += ["--out", str(out)]
     start = time.perf_counter()
     subprocess.run([*command, *options], check=True, timeout=1500)
     made: dict[str, Any] = json.loads((out / "summary.json").read_text())

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_without_renderer import BLOCK
+from blocked_renderer import BLOCK
 
-from hw.clock import WallClock
-from hw.serial_link import Link
-from pipeline.capture.stream import StreamReader
+from hw.base.clock import WallClock
+from hw.serial.link import Link
+from pipeline.stream.stream import StreamReader
 
 WIDTH, HEIGHT = 64, 48
 SCENE = f"""
@@ -74,7 +74,7 @@ responsivity = [1e12]
 
 
 def disco_twin(*words: object) -> subprocess.Popen[str]:
-    code = BLOCK + f"from disco_twin.cli import main; main({list(map(str, words))!r})"
+    code = BLOCK + f"from disco_twin.cli.app import main; main({list(map(str, words))!r})"
     return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -197,7 +197,7 @@ def test_a_guard_that_is_killed_in_the_middle_of_a_scan(rig: Path, camera: Any, 
     process = begun(rig, tmp_path)
     listed = ["ps", "-ww", "-o", "pid=,args=", "--ppid", str(process.pid)]
     children = subprocess.run(listed, capture_output=True, text=True, check=True).stdout.splitlines()
-    (guard,) = [int(line.split()[0]) for line in children if "hw.guard" in line]
+    (guard,) = [int(line.split()[0]) for line in children if "hw.safety.guard" in line]
     os.kill(guard, signal.SIGKILL)
     status, said = finish(process)
     assert not emits(rig)

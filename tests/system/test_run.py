@@ -30,7 +30,7 @@ lights = ["uniform", "directional"]
 
 
 def disco_twin(*arguments: object) -> subprocess.Popen[str]:
-    code = "from disco_twin.cli import main; main()"
+    code = "from disco_twin.cli.app import main; main()"
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

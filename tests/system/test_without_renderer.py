@@ -7,15 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-
-BLOCK = """
-import sys
-class NoRenderer:
-    def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in ("mitsuba", "drjit"):
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-sys.meta_path.insert(0, NoRenderer())
-"""
+from blocked_renderer import BLOCK
 
 
 def without_renderer(code: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -39,13 +31,14 @@ def test_every_module_of_hw_and_pipeline_imports(repository: Path) -> None:
 
 @pytest.mark.parametrize("command", [["plan", "scenes/quick.toml"], ["--help"], ["run", "--help"]])
 def test_commands_that_need_no_renderer(command: list[str], repository: Path) -> None:
-    done = without_renderer(f"from disco_twin.cli import main; main({command!r})", repository)
+    done = without_renderer(f"from disco_twin.cli.app import main; main({command!r})", repository)
     assert done.returncode == 0, done.stderr
     assert done.stdout
 
 
 def test_doctor_and_run_say_what_is_missing(repository: Path, tmp_path: Path) -> None:
-    code = f"from disco_twin.cli import main; main(['capture', 'scenes/slab.toml', '--out', {str(tmp_path / 'o')!r}])"
+    arguments = ["capture", "scenes/slab.toml", "--out", str(tmp_path / "o")]
+    code = f"from disco_twin.cli.app import main; main({arguments!r})"
     done = without_renderer(code, repository)
     assert done.returncode == 2
     assert "the renderer is not installed" in done.stderr

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from disco_twin.backend import activate
+from disco_twin.light.backend import activate
 
 activate()

@@ -212,7 +212,7 @@ def test_equilibrium_in_even_light(shape: str, kind: str) -> None:
     Expected behaviour: the power that leaves through each patch, cavity walls included, is pi * radiance *
     Tbar(eta) * area; z-scores from 32 replicates for each octant of each shell. Nothing is absorbed.
     """
-    from pipeline.calibrate.fresnel import mean_transmittance
+    from pipeline.geometry.fresnel import mean_transmittance
 
     mesh = SHAPES[shape]()
     eta = 1.0 if kind == "matched" else 1.4

@@ -12,9 +12,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from bumpy_twin import SPOT, bumpy
 from numpy.typing import NDArray
 from significance import assert_z, z_of_difference
-from test_estimators import SPOT, bumpy
 from twins import beam, twin
 
 from disco_twin.light.distance import NEAR, DistanceField, build_distance_field, sample_surface
@@ -26,7 +26,7 @@ from disco_twin.light.tables import free_flight, medium_at, surroundings
 from disco_twin.light.transport import Transport
 from disco_twin.object import shapes
 from disco_twin.object.build import Medium, TwinObject
-from disco_twin.object.schema import Pebble
+from disco_twin.scene.object_schema import Pebble
 
 F64 = NDArray[np.float64]
 REPLICATES = 32

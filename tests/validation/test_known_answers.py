@@ -7,24 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from half_spaces import HALF_SPACE, half_space
 from numpy.typing import NDArray
 from significance import assert_z, z_of_replicates
-from twins import beam, block, camera, escaped, pixel_areas, twin
+from twins import beam, camera, escaped, pixel_areas
 
 from disco_twin.light.transport import Transport
 from disco_twin.object.build import TwinObject, build_object
-from disco_twin.scene import load_scene
+from disco_twin.scene.scene import load_scene
 
 F64 = NDArray[np.float64]
 REPLICATES = 32
-
-# Diffuse reflectance of a half-space without its specular part: isotropic scattering, normal incidence, albedo
-# .9, .99, .999 and .9999 (Chandrasekhar's H function with Fresnel's boundary; at n = 1 it is 1 - sqrt(1 - c) H(1)).
-HALF_SPACE = {
-    1.0: (0.414947, 0.752721, 0.912845, 0.971418),
-    1.3: (0.285783, 0.645394, 0.856754, 0.940717),
-    1.5: (0.219919, 0.561981, 0.801459, 0.905536),
-}
 
 
 def h_function(albedo: float, mu: F64, nodes: int = 64) -> F64:
@@ -42,11 +35,6 @@ def h_function(albedo: float, mu: F64, nodes: int = 64) -> F64:
             break
         h = (h + new) / 2 if albedo > 0.99 else new
     return step(mu)
-
-
-def half_space(n: float, albedo: tuple[float, ...], width: float = 80.0, depth: float = 20.0) -> TwinObject:
-    """A block of 10 mean free paths a millimetre, so wide and deep that nothing reaches its other sides."""
-    return twin(block(width, depth), "matched" if n == 1 else "smooth", n, 10.0, albedo)
 
 
 def test_h_function_gives_the_published_reflectances() -> None:

@@ -21,10 +21,10 @@ from pathlib import Path
 import pytest
 
 from disco_twin.firmware.mm_ard import ARGUMENTS, MirrorHead, MmArdFirmware
-from hw.clock import WallClock
+from hw.base.clock import WallClock
+from hw.base.errors import WrongDevice
 from hw.devices import mm_ard
-from hw.errors import WrongDevice
-from hw.serial_link import Link
+from hw.serial.link import Link
 
 SKETCH = os.environ.get("MM_ARD_INO", "")
 pytestmark = [

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from disco_twin.experiment.experiment import Experiment
 from disco_twin.light.sources import BeamSource
 from disco_twin.light.transport import Transport
-from disco_twin.scene import load_scene
-from disco_twin.world import World
-from pipeline.reconstruct.mesh import vertex_areas
+from disco_twin.scene.scene import load_scene
+from pipeline.geometry.mesh import vertex_areas
 
 SPOTS, WALKS = 64, 20_000
 
@@ -24,7 +24,7 @@ def test_a_fifth_of_the_light_leaves_beyond_three_edges(repository: Path) -> Non
 
     Expected behaviour: at least a fifth of all light (measured: .207 +- .005; by wavelength .217 .209 .193).
     """
-    world = World(load_scene(repository / "scenes" / "quick.toml", faults=False))
+    world = Experiment(load_scene(repository / "scenes" / "quick.toml", faults=False))
     mesh, edge = world.object.mesh, float(world.scan.edges_unique_length.mean())
     area = vertex_areas(mesh)
     at = np.random.default_rng(0).choice(len(area), SPOTS, replace=False, p=area / area.sum())

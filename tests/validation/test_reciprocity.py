@@ -13,7 +13,7 @@ from twins import twin
 from disco_twin.light.transport import Transport
 from disco_twin.light.truth import REPLICATES, truth_columns
 from disco_twin.object.build import Boundary, Medium, TwinObject, hat_basis
-from pipeline.calibrate.fresnel import mean_transmittance
+from pipeline.geometry.fresnel import mean_transmittance
 
 F64 = NDArray[np.float64]
 RUNS = 4  # of truth_columns, each of REPLICATES replicates: 28 degrees of freedom

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from disco_twin.experiment.experiment import reference_key
 from disco_twin.light.references import load_reference, render_reference
 from disco_twin.light.transport import Transport
 from disco_twin.object.build import build_object
-from disco_twin.scene import load_scene
-from disco_twin.simulate import reference_path
-from disco_twin.world import reference_key
-from pipeline.calibrate.camera import PinholeCamera
+from disco_twin.run.simulate import reference_path
+from disco_twin.scene.scene import load_scene
+from pipeline.geometry.camera import PinholeCamera
 from tests.validation.significance import assert_z
 
 REPLICATES, WALKS, BLOCK = 16, 200_000, 31  # large blocks: the noise of small ones is far from normal

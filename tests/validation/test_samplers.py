@@ -10,36 +10,21 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from random_streams import F64, N, azimuth, streams
 from significance import assert_chi_squared, assert_uniform, assert_z
 
 from disco_twin.light import sampling
 from disco_twin.light.sampling import Rng
 
-F64 = NDArray[np.float64]
-N = 1 << 19
 AXIS = np.array([0.36, -0.48, 0.8])
-
-
-def streams(seed: int = 1, stream: int = 2, first: int = 0, n: int = N) -> Rng:
-    return Rng.of(mi.UInt32(seed), mi.UInt32(stream), dr.arange(mi.UInt32, n) + first)
 
 
 def samples(sampler: Callable[[Rng], Any], **key: int) -> F64:
     """(N, k) float64, one sample of each photon."""
     return np.atleast_2d(np.array(sampler(streams(**key)), np.float64)).T
-
-
-def azimuth(direction: F64, axis: F64) -> tuple[F64, F64]:
-    """(N, 3) directions -> cosine to `axis` and azimuth about it as a share of the circle, in a frame of its own."""
-    side = np.cross(axis, [0.0, 1.0, 0.1])
-    side /= np.linalg.norm(side)
-    up = np.cross(axis, side)
-    return direction @ axis, np.arctan2(direction @ up, direction @ side) / (2 * math.pi) % 1.0
 
 
 def share_of_bins(density: Callable[[Any], Any], edges: F64) -> F64:

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from disco_twin.deviation import actual_rig
-from disco_twin.firmware.emulate import Emulation
-from disco_twin.rig import TwinRig
-from disco_twin.scene import load_scene
-from disco_twin.world import World
-from hw.bytelog import read_log
-from pipeline.capture.files import IMAGES, JOURNAL, PLAN
+from disco_twin.emulation.emulated_rig import Emulation
+from disco_twin.emulation.twin_rig import TwinRig
+from disco_twin.experiment.experiment import Experiment
+from disco_twin.faults.actual_rig import actual_rig
+from disco_twin.scene.scene import load_scene
+from hw.serial.bytelog import read_log
 from pipeline.capture.loop import capture
+from pipeline.stream.files import IMAGES, JOURNAL, PLAN
 
 pytestmark = pytest.mark.slow
 
@@ -24,7 +24,7 @@ def test_quick_through_serial_lines_equals_the_direct_twin(repository: Path, tmp
     Expected behaviour: 1806 images, and the three files of the stream are the same bytes; no light while anything
     moves, never two lasers at once.
     """
-    world = World(load_scene(repository / "scenes" / "quick.toml", faults=False))
+    world = Experiment(load_scene(repository / "scenes" / "quick.toml", faults=False))
     scene, transport = world.scene, world.transport
     from disco_twin.light.response import SpotResponses
 

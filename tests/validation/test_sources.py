@@ -15,8 +15,8 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from random_streams import N, azimuth, streams
 from significance import assert_chi_squared, assert_uniform, assert_z
-from test_samplers import N, azimuth, streams
 
 from disco_twin.light.sources import BeamSource, HatSource, Source, light_source
 from pipeline.relight.lights import Beam, Directional, Environment, Lobe, TexturedProjector, Uniform

@@ -9,10 +9,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from bumpy_twin import SPOT, VIEWS, blocks, bumpy
+from half_spaces import HALF_SPACE, half_space
 from numpy.typing import NDArray
 from significance import assert_z, z_of_difference, z_of_replicates
-from test_estimators import SPOT, VIEWS, blocks, bumpy
-from test_known_answers import HALF_SPACE, half_space
 from twins import beam, block, camera, escaped, twin
 
 from disco_twin.light.importance import STEEPEST, Splitting, diffusion, window_targets

@@ -19,8 +19,8 @@ from benchmarks.volpath import volpath_scene
 from disco_twin.light.references import render_reference
 from disco_twin.light.transport import Transport
 from disco_twin.object.build import Boundary, Medium, TwinObject, build_object
-from disco_twin.scene import load_scene
-from pipeline.calibrate.camera import PinholeCamera, look_at
+from disco_twin.scene.scene import load_scene
+from pipeline.geometry.camera import PinholeCamera, look_at
 from pipeline.relight.lights import Directional, Uniform
 from tests.validation.significance import assert_z, z_of_difference
 

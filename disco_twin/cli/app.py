@@ -1,0 +1,230 @@
+"""The command line. Errors that a user can mend are one line on stderr and exit status 2, never a traceback."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from rich.console import Console
+
+from disco_twin.cli.rig import ArmOption, LogsOption, rig_app
+from hw.base.errors import DiscoError, InputError, naming, refused_by_the_disk
+from pipeline.capture.loop import Interrupted
+
+app = typer.Typer(
+    help="A digital twin of the DISCO rig: simulate a laser capture, reconstruct R_d, relight, score.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+console = Console()
+
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="The scene's TOML file.")]
+RunOut = Annotated[Path, typer.Option("--out", metavar="DIR", help="The run folder.")]
+ProfileOption = Annotated[
+    Literal["full", "small"], typer.Option(help="`small` shrinks the scene: fewer spots, pixels and walks.")
+]
+FaultsOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--faults/--no-faults",
+        help="All rig faults of 2004 on (the pipeline then calibrates from the rig's images) or off; else the scene's.",
+    ),
+]
+BudgetOption = Annotated[
+    bool, typer.Option("--budget", help="Reconstruct with parts of the calibration made true: what does each cost?")
+]
+MethodsOption = Annotated[
+    str | None, typer.Option(help="`all`, or a list such as default,disco2004; left out: the scene's.")
+]
+app.add_typer(rig_app, name="rig")
+
+
+@app.command()
+def run(
+    scene: SceneFile,
+    out: RunOut,
+    profile: ProfileOption = "full",
+    methods: MethodsOption = None,
+    faults: FaultsOption = None,
+) -> None:
+    """Capture, reconstruct, relight and score; writes summary.json and report.html. The same command resumes."""
+    from disco_twin.run.stages import open_run, print_scores, run_all
+
+    with naming(scene):
+        opened = open_run(scene, out, profile, methods, console, faults)
+        console.print(f"[bold]{opened.scene.name}[/bold] into {out}", highlight=False)
+        summary = run_all(opened)
+    print_scores(summary, opened.methods, console)
+    console.print(f"\nreport: {opened.folder.report_file.resolve()}", soft_wrap=True, highlight=False)
+
+
+@app.command()
+def capture(
+    scene: SceneFile,
+    out: RunOut,
+    profile: ProfileOption = "full",
+    faults: FaultsOption = None,
+    rig: Annotated[
+        Path | None, typer.Option(metavar="RIG.TOML", help="Capture with the devices of a rig file, not with the twin.")
+    ] = None,
+    arm: ArmOption = False,
+    logs: LogsOption = None,
+) -> None:
+    """Scan and capture only: DIR/capture is what the pipeline reads."""
+    from disco_twin.run.device_capture import capture_with_devices
+    from disco_twin.run.progress import run_log
+    from disco_twin.run.stages import capture_stages, open_run
+
+    if rig is None and (arm or logs is not None):
+        option = "--arm" if arm else "--logs"
+        raise InputError("is for devices", key=option, remedy=f"name their rig file with --rig, or leave {option} out")
+    with naming(scene):
+        opened = open_run(scene, out, profile, None, console, faults)
+        with run_log(opened.folder.root / "run.log", console):
+            if rig is None:
+                capture_stages(opened)
+            else:
+                capture_with_devices(opened, rig, logs, armed=arm)
+
+
+@app.command("import")
+def import_(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="capture.toml, images.csv and 16-bit frames.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The capture that `python -m pipeline` reads.")],
+) -> None:
+    """Turn a capture that was made without this software into ours. Needs no renderer."""
+    from disco_twin.run.progress import stage_bar
+    from pipeline.capture.import_folder import import_capture
+
+    with stage_bar(console, "import", "images") as report:
+        plan_ = import_capture(folder, out, report)
+    console.print(f"{len(plan_)} images, {plan_.views} views, {len(plan_.spots)} spots", highlight=False)
+
+
+@app.command()
+def quality(
+    capture_folder: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture: DIR/capture of a run.")],
+) -> None:
+    """Show the quality of a capture view by view, finished or not. Needs no renderer."""
+    from disco_twin.run.progress import quality_table
+    from hw.base.config import read_json
+    from pipeline.capture.quality import examine
+    from pipeline.records import SensorFile
+    from pipeline.stream.stream import StreamReader
+
+    sensor = read_json(capture_folder / "sensor.json", SensorFile, "give the folder `capture` of a run").sensor
+    with StreamReader(capture_folder) as stream:
+        views = list(examine(stream, sensor))
+    console.print(quality_table(views))
+    for view in views:
+        for remark in view.remarks:
+            console.print(f"view {view.view}: {remark}", highlight=False, soft_wrap=True)
+
+
+@app.command()
+def reconstruct(out: RunOut, methods: MethodsOption = None) -> None:
+    """Reconstruct and relight a capture. Needs no renderer."""
+    from disco_twin.run.progress import run_log
+    from disco_twin.run.stages import pipeline_stage, reopen_run
+
+    opened = reopen_run(out, methods, console)
+    with naming(opened.scene_file), run_log(opened.folder.root / "run.log", console):
+        pipeline_stage(opened)
+
+
+@app.command()
+def reference(scene: SceneFile, out: RunOut, profile: ProfileOption = "full") -> None:
+    """Render the reference images of a scene into DIR, one EXR per light and held-out view."""
+    from disco_twin.experiment.experiment import Experiment
+    from disco_twin.run.progress import stage_bar
+    from disco_twin.run.simulate import render_references, require_capturable, shipped_references
+    from disco_twin.scene.scene import load_scene
+
+    loaded = load_scene(scene, profile)
+    with naming(scene), stage_bar(console, "references", "lights") as report:
+        experiment = Experiment(loaded)
+        require_capturable(experiment)
+        lights = render_references(experiment, shipped_references(scene, loaded.name), out, report)
+    console.print(f"{lights} lights rendered, {len(loaded.relight.lights) - lights} were there", highlight=False)
+
+
+@app.command()
+def score(out: RunOut, methods: MethodsOption = None, budget: BudgetOption = False) -> None:
+    """Score a finished run again and write its summary and report. Needs no renderer."""
+    from disco_twin.run.progress import run_log
+    from disco_twin.run.stages import print_budget, print_scores, reopen_run, score_stages
+
+    opened = reopen_run(out, methods, console)
+    with naming(opened.scene_file), run_log(opened.folder.root / "run.log", console):
+        print_scores(score_stages(opened), opened.methods, console)
+        if budget:
+            from disco_twin.evaluate.budget import score_budget
+
+            print_budget(score_budget(opened.experiment, opened.folder, opened.methods[0]), console)
+
+
+@app.command()
+def plan(scene: SceneFile, profile: ProfileOption = "full") -> None:
+    """Predict images, bytes and time of a scene, and say what it leaves out. Needs no renderer."""
+    from disco_twin.experiment.experiment import Experiment
+    from disco_twin.run.cost_prediction import predict
+    from disco_twin.run.simulate import require_capturable, shipped_references
+    from disco_twin.scene.scene import load_scene
+
+    with naming(scene):
+        experiment = Experiment(load_scene(scene, profile))
+        require_capturable(experiment)
+        lines = predict(experiment, shipped_references(scene, experiment.scene.name))
+    for name, value in lines:
+        console.print(f"  {name:<12} {value}", highlight=False, soft_wrap=True)
+
+
+@app.command()
+def doctor() -> None:
+    """Check the installation: versions, LLVM, a small render, memory, disk. Exit status 1 if something is missing."""
+    from disco_twin.cli.doctor import examine
+
+    findings = examine(Path.cwd())
+    for finding in findings:
+        console.print(str(finding), highlight=False, markup=False, soft_wrap=True)
+    if not all(f.good for f in findings):
+        raise typer.Exit(1)
+
+
+def main(arguments: list[str] | None = None) -> Any:
+    """Entry point of `disco-twin`."""
+    words = sys.argv[1:] if arguments is None else arguments
+    try:
+        status = app(words or ["--help"], prog_name="disco-twin", standalone_mode=False)
+    except Interrupted as error:
+        return _stop(str(error), 130)
+    except typer.Abort:
+        return _stop("stopped", 130)
+    except DiscoError as error:
+        return _stop(str(error), 2)
+    except OSError as error:
+        known = refused_by_the_disk(error, Path.cwd())
+        reason = f"{error.filename or 'input or output'}: {error.strerror or error}"
+        return _stop(str(known or f"{reason}. Remedy: correct the path, repeat the same command"), 2)
+    except MemoryError:
+        return _stop("not enough memory. Remedy: fewer pixels, spots or scan.vertices, or a machine with more", 2)
+    except Exception as error:
+        if not hasattr(error, "format_message"):  # of wrong options and arguments; where its class lies, typer changes
+            raise
+        context = getattr(error, "ctx", None)
+        command = "disco-twin" if context is None else context.command_path
+        problem = str(error.format_message()).rstrip(".?")
+        return _stop(f"{problem}. Remedy: `{command} --help` says what is allowed", 2)
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _stop(message: str, status: int) -> None:
+    line = " ".join(message.splitlines())
+    Console(stderr=True).print(f"disco-twin: {line}", style="red", highlight=False, markup=False, soft_wrap=True)
+    sys.exit(status)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""`disco-twin rig`: find, test and emulate the devices of a rig file. Needs no renderer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from hw.base.errors import InputError
+from hw.safety.signals import interruptible, raise_if_interrupted
+from pipeline.capture.loop import Interrupted
+
+if TYPE_CHECKING:
+    from disco_twin.emulation.rig_file import DevicesFile
+    from disco_twin.emulation.selftest import Finding
+    from pipeline.geometry.nominal_rig import RigConfig
+
+rig_app = typer.Typer(help="Devices: find them, test them, emulate them.")
+console = Console()
+
+LONGEST_S = 1e7  # that devices are emulated: 116 days
+
+RigPath = Annotated[Path, typer.Argument(metavar="RIG.TOML", help="The rig file.")]
+SceneOption = Annotated[
+    Path | None, typer.Option("--scene", metavar="SCENE", help="The scene, which knows the cameras' sizes.")
+]
+ArmOption = Annotated[bool, typer.Option("--arm", help="Let real lasers emit.")]
+LogsOption = Annotated[
+    Path | None, typer.Option("--logs", metavar="DIR", help="Keep every byte to and from the devices there.")
+]
+
+
+@rig_app.command()
+def probe(rig: RigPath, scene: SceneOption = None, logs: LogsOption = None) -> None:
+    """Connect to every real device and show what it is. Switches lasers off and shuts gates; nothing moves."""
+    from disco_twin.emulation.selftest import probe as run_probe
+
+    _show(run_probe(*_loaded(rig, scene), logs))
+
+
+@rig_app.command()
+def selftest(rig: RigPath, scene: SceneOption = None, arm: ArmOption = False, logs: LogsOption = None) -> None:
+    """Move, expose and read back every real device. Lasers emit only with --arm."""
+    from disco_twin.emulation.selftest import selftest as run_selftest
+
+    _show(run_selftest(*_loaded(rig, scene), arm, logs))
+
+
+@rig_app.command()
+def emulate(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="The scene whose devices are emulated.")],
+    folder: Annotated[Path, typer.Option("--ports", metavar="DIR", help="Where the ports and rig.toml appear.")],
+    seconds: Annotated[float, typer.Option(help="How long.")] = 3600.0,
+) -> None:
+    """Serve the devices of a scene on pseudo-terminals, in real time, and write the rig file that reaches them."""
+    from disco_twin.emulation.served_rig import served
+    from disco_twin.scene.scene import load_scene
+
+    if not 0.1 <= seconds <= LONGEST_S:
+        allowed = f"0.1 to {LONGEST_S:.0f}"
+        raise InputError("is no such time", key="--seconds", value=seconds, allowed=allowed, remedy="choose another")
+    loaded = load_scene(scene)
+    with interruptible():
+        try:
+            with served(loaded.rig, loaded.seed, folder) as path:
+                said = f"devices are served; rig file: {path}   (Ctrl-C ends it)"
+                console.print(said, highlight=False, soft_wrap=True)
+                time.sleep(seconds)
+        except KeyboardInterrupt:
+            console.print("ended")
+
+
+def _loaded(path: Path, scene: Path | None) -> tuple[DevicesFile, RigConfig | None]:
+    """The rig file, and the rig of the scene that goes with it."""
+    from disco_twin.emulation.rig_rules import load_rig_file, require_scene
+    from disco_twin.scene.scene import load_scene
+
+    file = load_rig_file(path)
+    if scene is None:
+        return file, None
+    rig = load_scene(scene).rig
+    require_scene(file, rig, path)
+    return file, rig
+
+
+def _show(findings: Generator[Finding, None, None]) -> None:
+    """Print them as they come. Whatever ends that, a signal or a closed pipe, what they use is made safe first."""
+    good, count = True, 0
+    with interruptible(), closing(findings):
+        try:
+            for finding in findings:
+                raise_if_interrupted()  # where a device's failure on the way out hid it
+                console.print(str(finding), highlight=False, markup=False, soft_wrap=True)
+                good, count = good and finding.good, count + 1
+        except KeyboardInterrupt:
+            raise Interrupted("stopped: gates and lamps were told off, and every laser that was on") from None
+    if not count:
+        console.print("every device of this rig file is emulated or simulated: there is nothing to connect to")
+    if not good:
+        raise typer.Exit(1)

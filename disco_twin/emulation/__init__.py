@@ -1,0 +1,1 @@
+"""The twin behind the rig's interface, and emulated devices on ports."""

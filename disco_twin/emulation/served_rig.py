@@ -1,0 +1,96 @@
+"""`disco-twin rig emulate`: the devices of a scene for another program, in real time, on pseudo-terminals."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_twin.emulation.selftest import rig_file_of
+from disco_twin.experiment.run_folder import require_folder, write_atomically
+from hw.base.clock import WallClock
+from hw.base.errors import DiscoError, InputError
+from hw.interface import Aim
+from pipeline.geometry.nominal_rig import RigConfig
+
+if TYPE_CHECKING:
+    from disco_twin.emulation.emulated_rig import Emulation
+
+F32 = NDArray[np.float32]
+
+
+class Darkness:
+    """A response source for devices without a camera."""
+
+    def prepare(self, aims: Sequence[Aim]) -> None:
+        """Nothing to do."""
+
+    def image(self, camera: int, aim: Aim, laser: int) -> F32:
+        """Nobody looks."""
+        raise DiscoError("these emulated devices have no camera")
+
+    def silhouette(self, camera: int, angle: int) -> F32:
+        """Nobody looks."""
+        raise DiscoError("these emulated devices have no camera")
+
+
+def emulated_devices(scene: RigConfig, seed: int) -> Emulation:
+    """The devices of a scene in real time, for cameras elsewhere: the photodiode reads what falls on it now."""
+    from disco_twin.emulation.emulated_rig import Emulation
+    from disco_twin.emulation.twin_rig import TwinRig, watts_per_count
+
+    emulation = Emulation(TwinRig(scene, Darkness(), seed), WallClock())
+    bench = emulation.bench
+
+    def live(pin: int) -> int:
+        if bench.light() != [pin]:
+            return 0
+        watts = bench.heads[pin].emission(bench.clock.now()) * bench.heads[pin].max_power_mw * 1e-3
+        return round(watts / watts_per_count(scene.lasers[pin]))
+
+    bench.board.sample = live
+    return emulation
+
+
+@contextmanager
+def served(scene: RigConfig, seed: int, folder: Path) -> Iterator[Path]:
+    """Emulated devices on pseudo-terminals in a folder, and the rig file that reaches them."""
+    from disco_twin.emulation.serve import Server
+
+    require_folder(folder, "--ports")
+    lines, path = emulated_devices(scene, seed).lines, folder / "rig.toml"
+    remedy = "choose another --ports, or take it away"
+    with _alone_in(folder):
+        for port in (folder / name for name in lines):
+            if port.exists() and not port.is_symlink():
+                raise InputError("is in the place of an emulated device's port", file=port, remedy=remedy)
+        content = rig_file_of(scene, {name: str((folder / name).absolute()) for name in lines}).encode()
+        if path.exists() and path.read_bytes() != content:
+            raise InputError("is another rig file than the one to be written", file=path, remedy=remedy)
+        with Server(lines, folder):
+            write_atomically(path, content)
+            yield path
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Refuse a folder in which another emulator serves: its links would be taken over, and taken away at the end.
+
+    The lock is the folder's own and ends with its program, however that ends: nothing is left behind.
+    """
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            problem, remedy = "an emulator that is running serves its devices here", "end it, or choose another --ports"
+            raise InputError(problem, file=folder, remedy=remedy) from error
+        yield
+    finally:
+        os.close(lock)

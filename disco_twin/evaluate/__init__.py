@@ -1,0 +1,1 @@
+"""Scores against truth and references, the error budget, the simulation's noise, summary.json."""

@@ -1,0 +1,152 @@
+"""What each part of the calibration costs: the same capture reconstructed with parts of the calibration made true.
+
+`disco-twin score --budget`. Poses and projector are measured in one frame at each turntable angle, that of the scan as
+its silhouettes were understood, which stands turned against the object. Where one of the two is made true, the other
+keeps its relation to the cameras: otherwise beams and images would not meet on the object, which is no error of either.
+The truth goes to the pipeline here on purpose, into folders of the twin's own, and into no score of the run.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from disco_twin.camera.lens import Glare
+from disco_twin.experiment.experiment import Experiment
+from disco_twin.experiment.pipeline_process import reconstruct_apart
+from disco_twin.experiment.run_folder import RunFolder, write_atomically
+from disco_twin.faults.actual_rig import ActualRig, actual_rig
+from hw.base.errors import InputError
+from pipeline.calibrate.calibration import Calibration, ProjectorCalibration, nominal_calibration, pair, pose_rows
+from pipeline.geometry.nominal_rig import RigConfig
+
+FORMAT_VERSION = 1
+RECORD = "budget.json"
+
+
+@dataclass
+class VariantFolder(RunFolder):
+    """A folder to work in beside a run's own; capture and truth are the run's."""
+
+    base: RunFolder | None = None
+
+    @property
+    def capture(self) -> Path:
+        assert self.base is not None
+        return self.base.capture
+
+    @property
+    def twin(self) -> Path:
+        assert self.base is not None
+        return self.base.twin
+
+
+def true_calibration(rig: RigConfig, actual: ActualRig, nominal: Calibration) -> Calibration:
+    """The calibration that a measurement without error would give. Each mirror move's own error stays out of reach.
+
+    A lens that throws light outside the image is a little darker: all images lose the same share.
+    """
+    views = []
+    for v, view in enumerate(nominal.views):
+        camera, angle = divmod(v, nominal.n_angles)
+        lens = actual.camera(camera, angle)
+        kept = Glare.of(lens.height, lens.width).kept() if rig.faults.flare else 1.0
+        views.append(
+            view.model_copy(
+                update={
+                    "focal_px": pair(lens.focal),
+                    "centre_px": pair(lens.centre),
+                    "distortion": tuple(float(x) for x in lens.distortion),
+                    "object_to_camera": pose_rows(lens.pose),
+                    "radiance_factor": tuple(float(x) for x in actual.photodiode / (kept * actual.response[camera])),
+                }
+            )
+        )
+    projectors = [
+        p.model_copy(
+            update={
+                "full_angle_rad": pair(actual.projector.full_angle_rad),
+                "object_to_projector": pose_rows(actual.projector.seen_from(actual.turns[j]).pose),
+            }
+        )
+        for j, p in enumerate(nominal.projectors)
+    ]
+    return nominal.model_copy(update={"source": "measured", "views": tuple(views), "projectors": tuple(projectors)})
+
+
+def _photometric(own: Calibration, true: Calibration) -> Calibration:
+    pairs = zip(own.views, true.views, strict=True)
+    views = tuple(v.model_copy(update={"radiance_factor": t.radiance_factor}) for v, t in pairs)
+    return own.model_copy(update={"views": views})
+
+
+def _pose(own: Calibration, true: Calibration) -> Calibration:
+    pairs = zip(own.views, true.views, strict=True)
+    views = tuple(t.model_copy(update={"radiance_factor": v.radiance_factor}) for v, t in pairs)
+    return own.model_copy(update={"views": views, "projectors": _seen_from(own.projectors, _frames(true, own))})
+
+
+def _projector(own: Calibration, true: Calibration) -> Calibration:
+    return own.model_copy(update={"projectors": _seen_from(true.projectors, _frames(own, true))})
+
+
+def _frames(here: Calibration, there: Calibration) -> list[NDArray[np.float64]]:
+    """Per turntable angle, (4, 4) one calibration's object frame -> another's: a rotation, the mean of the views."""
+    frames = []
+    for j in range(here.n_angles):
+        a, b = ([np.array(c.views[v].object_to_camera)[:3, :3] for v in c.views_at(j)] for c in (here, there))
+        turned = np.eye(4)
+        turned[:3, :3] = Rotation.from_matrix([y.T @ x for x, y in zip(a, b, strict=True)]).mean().as_matrix()
+        frames.append(turned)
+    return frames
+
+
+def _seen_from(
+    projectors: Sequence[ProjectorCalibration], frames: Sequence[NDArray[np.float64]]
+) -> tuple[ProjectorCalibration, ...]:
+    """The projectors in other frames, given the (4, 4) transform from each to theirs."""
+    poses = [pose_rows(np.array(p.object_to_projector) @ f) for p, f in zip(projectors, frames, strict=True)]
+    return tuple(p.model_copy(update={"object_to_projector": x}) for p, x in zip(projectors, poses, strict=True))
+
+
+VARIANTS: dict[str, Callable[[Calibration, Calibration], Calibration]] = {
+    "true photometric": _photometric,
+    "true pose": _pose,
+    "true projector": _projector,
+    "all true": lambda _, true: true,
+}
+
+
+def score_budget(experiment: Experiment, folder: RunFolder, method: str) -> list[dict[str, Any]]:
+    """Rows {calibration, light, view, nrmse, ...} of one method: as measured, uncalibrated, and each part made true."""
+    from disco_twin.evaluate.scores import score_relit_images
+
+    scene = experiment.scene
+    own = Calibration.load(folder.work / "calibration.json")
+    if own.source != "measured":
+        raise InputError(
+            "the calibration was not measured: nothing to replace by truth",
+            file=folder.work / "calibration.json",
+            remedy="disco-twin run SCENE --faults --out DIR",
+        )
+    nominal = nominal_calibration(scene.rig, own.sensor)
+    true = true_calibration(scene.rig, actual_rig(scene.rig, scene.seed), nominal)
+    rows = [{"calibration": "measured"} | row for row in score_relit_images(experiment, folder, (method,))]
+    wanted = {"nominal": nominal} | {name: make(own, true) for name, make in VARIANTS.items()}
+    for name, calibration in wanted.items():
+        variant = VariantFolder(folder.twin / "budget" / name.replace(" ", "-"), base=folder)
+        variant.work.mkdir(parents=True, exist_ok=True)
+        given = variant.root / "calibration.json"
+        calibration.save(given)
+        reconstruct_apart(scene, variant, (method,), given)
+        rows += [{"calibration": name} | row for row in score_relit_images(experiment, variant, (method,))]
+    record = {"format_version": FORMAT_VERSION, "method": method, "rows": rows}
+    write_atomically(folder.twin / RECORD, (json.dumps(record, indent=1) + "\n").encode())
+    return rows

@@ -1,0 +1,143 @@
+"""Relit images against references, R_d against the truth: design.md's scores for every method of a run."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_twin.experiment.experiment import Experiment
+from disco_twin.experiment.run_folder import RunFolder, write_atomically
+from disco_twin.run.simulate import reference_path
+from hw.base.config import Strict, read_json
+from hw.base.errors import InputError
+
+if TYPE_CHECKING:
+    from pipeline.geometry.nominal_rig import CameraConfig
+    from pipeline.model.reflectance import ReflectanceModel
+
+log = logging.getLogger(__name__)
+
+FORMAT_VERSION = 1
+KEPT = ("nrmse", "nrmse_se", "nrmse_floor", "psnr", "energy_ratio")
+F32 = NDArray[np.float32]
+
+
+class _Scores(Strict):
+    """scores.json."""
+
+    format_version: Literal[1]
+    relit: tuple[dict[str, float | str | None], ...]
+    reflectance: dict[str, dict[str, dict[str, float | None]] | None]
+
+
+def score_run(experiment: Experiment, folder: RunFolder, methods: Sequence[str]) -> None:
+    """Write OUT/twin/scores.json: `relit` rows of every light, view and method, and `reflectance` by method."""
+    scores = {
+        "format_version": FORMAT_VERSION,
+        "relit": score_relit_images(experiment, folder, methods),
+        "reflectance": score_models(folder, methods),
+    }
+    write_atomically(scores_file(folder), json.dumps(scores, indent=1).encode())
+
+
+def scores_file(folder: RunFolder) -> Path:
+    """Where the scores lie: with the truth that they were made from, apart from the pipeline's work."""
+    return folder.twin / "scores.json"
+
+
+def load_scores(folder: RunFolder) -> dict[str, Any]:
+    """What `score_run` wrote."""
+    remedy = f"delete it, then disco-twin score --out {folder.root}"
+    return read_json(scores_file(folder), _Scores, remedy).model_dump()
+
+
+def score_relit_images(experiment: Experiment, folder: RunFolder, methods: Sequence[str]) -> list[dict[str, Any]]:
+    """Rows {light, view, method, nrmse, nrmse_se, nrmse_floor, psnr, energy_ratio}; what has no score holds None."""
+    from disco_twin.light.references import LAYERS, load_reference
+
+    rows = []
+    masks = {view.name: experiment.object_mask(view) for view in experiment.scene.relight.views}
+    layer = LAYERS.index("subsurface")  # R_d answers for light from below the surface
+    for light in experiment.scene.relight.lights:
+        for view in experiment.scene.relight.views:
+            a, b = load_reference(reference_path(folder.twin / "references", light, view)).halves[:, layer]
+            for method in methods:
+                image = load_relit(folder, method, light.name, view)
+                row = {"light": light.name, "view": view.name, "method": method}
+                rows.append(row | usable_score(" ".join(row.values()), image, a, b, masks[view.name]))
+    return rows
+
+
+def usable_score(what: str, image: F32, a: F32, b: F32, mask: NDArray[np.bool_]) -> dict[str, float | None]:
+    """The kept figures of `score_relit`; all None, with a warning, where they cannot be had or are not finite."""
+    from pipeline.relight.scores import Unscorable, score_relit
+
+    try:
+        score = asdict(score_relit(image, a, b, mask))
+        if not all(math.isfinite(score[k]) for k in KEPT if score[k] is not None):
+            raise Unscorable("the relit image holds numbers that are not finite")
+    except Unscorable as why:
+        log.warning("no score for %s: %s", what, why)
+        return dict.fromkeys(KEPT)
+    return {k: score[k] for k in KEPT}
+
+
+def load_relit(folder: RunFolder, method: str, light: str, view: CameraConfig) -> F32:
+    """(L, H, W) relit image in W/(mm^2 sr)."""
+    path = folder.work / "relit" / method / f"{light}@{view.name}.npy"
+    if not path.is_file():
+        raise InputError("is missing", file=path, remedy=f"disco-twin reconstruct --out {folder.root}")
+    remedy = f"delete it, then disco-twin reconstruct --out {folder.root}"
+    try:
+        image = np.asarray(np.load(path, allow_pickle=False))
+    except (OSError, ValueError, EOFError, SyntaxError) as error:
+        raise InputError("is damaged", file=path, remedy=remedy) from error
+    if image.ndim != 3 or image.shape[1:] != (view.height, view.width) or image.dtype.kind != "f":
+        allowed = f"(lasers, {view.height}, {view.width})"
+        raise InputError(f"is no image of this view but of {image.shape}", file=path, allowed=allowed, remedy=remedy)
+    return image
+
+
+def load_model(folder: RunFolder, method: str) -> ReflectanceModel | None:
+    """A method's R_d; None for the Lambertian surface, whose light leaves where it enters."""
+    from pipeline.model.reflectance import ReflectanceModel
+
+    return None if method == "lambertian" else ReflectanceModel.load(folder.work / f"model-{method}.npz")
+
+
+def score_models(folder: RunFolder, methods: Sequence[str]) -> dict[str, Any]:
+    """By method: log10_rmse of measured and of all entries and the coverage, each by decade below the peak.
+
+    A method whose R_d cannot be scored has None.
+    """
+    from disco_twin.light.truth import Truth
+    from pipeline.relight.scores import Unscorable, score_reflectance
+
+    truth = Truth.load(folder.twin / "truth.npz")
+    out: dict[str, Any] = {}
+    for method in methods:
+        model = load_model(folder, method)
+        if model is None:
+            continue
+        estimate, measured = model.reflectance[:, truth.columns], model.measured[truth.columns]
+        try:
+            own = score_reflectance(estimate, truth.mean, truth.standard_error, measured)
+            full = score_reflectance(estimate, truth.mean, truth.standard_error, True)
+        except Unscorable as why:
+            log.warning("no score for the R_d of %s: %s", method, why)
+            out[method] = None
+            continue
+        out[method] = {
+            "measured": {str(s.decade): s.log10_rmse for s in own},
+            "completed": {str(s.decade): s.log10_rmse for s in full},
+            "coverage": {str(s.decade): s.coverage for s in own},
+        }
+    return out

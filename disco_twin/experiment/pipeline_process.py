@@ -1,0 +1,84 @@
+"""Runs the pipeline as a process of its own: it is given the capture and a folder to work in, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from disco_twin.experiment.run_folder import RunFolder, write_atomically
+from disco_twin.scene.scene import Scene
+from hw.base.config import read_json
+from hw.base.errors import DiscoError
+from pipeline.records import PipelineRecord
+
+REQUEST = "request.json"
+
+
+class PipelineFailed(DiscoError):
+    """The pipeline's process ended with an error; the message is its own last line."""
+
+
+def pipeline_inputs(scene: Scene, methods: Sequence[str]) -> dict[str, Any]:
+    """What the pipeline is asked to do: settings, methods, and what to relight. Written as WORK/request.json."""
+    return {
+        "format_version": 1,
+        "reconstruct": scene.reconstruct.model_copy(update={"methods": tuple(methods)}).model_dump(mode="json"),
+        "relight": scene.relight.model_dump(mode="json"),
+    }
+
+
+def reconstruct_apart(
+    scene: Scene, folder: RunFolder, methods: Sequence[str], calibration: Path | None = None
+) -> float:
+    """Run `python -m pipeline` on the capture; its peak memory in MiB. Its messages go to OUT/work/pipeline.log.
+
+    calibration: a file to use instead of what the pipeline would calibrate itself.
+    The peak is the process's own word: `wait4` would count what our process held when it started the child.
+    """
+    request = folder.work / REQUEST
+    write_atomically(request, json.dumps(pipeline_inputs(scene, methods), indent=1).encode())
+    command = [sys.executable, "-m", "pipeline", str(folder.capture), str(folder.work), "--request", str(request)]
+    command += ["--until-stdin-closes", *(() if calibration is None else ("--calibration", str(calibration)))]
+    with tempfile.TemporaryFile("w+") as errors:
+        with (
+            (folder.work / "pipeline.log").open("w") as log,
+            subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=errors) as child,
+        ):
+            try:
+                status = child.wait()
+            except BaseException:
+                child.terminate()
+                raise
+        errors.seek(0)
+        said = errors.read().strip().splitlines()
+    if status != 0:
+        why = said[-1] if said else f"ended with status {status}"
+        if status == -signal.SIGKILL:
+            remedy = "a scan of fewer vertices (scan.vertices), fewer methods, or a machine with more memory"
+            raise PipelineFailed(f"{folder.capture}: the pipeline was killed, most likely for memory. Remedy: {remedy}")
+        raise PipelineFailed(why if status == 2 else f"the pipeline failed: {why} (see {folder.work / 'pipeline.log'})")
+    return max(row.peak_mb for row in load_results(folder).stages)
+
+
+def load_results(folder: RunFolder) -> PipelineRecord:
+    """What the pipeline's process wrote about its work."""
+    path = folder.work / "pipeline.json"
+    return read_json(path, PipelineRecord, f"delete it, then disco-twin reconstruct --out {folder.root}")
+
+
+def stale(scene: Scene, folder: RunFolder, methods: Sequence[str]) -> str | None:
+    """Why the latest reconstruction is not what these methods of this scene would be scored by; None if it is."""
+    made = load_results(folder).methods
+    missing = [method for method in methods if method not in made]
+    if missing:
+        return f"the latest reconstruct did not make {', '.join(missing)}, only {', '.join(made)}"
+    asked = read_json(folder.work / REQUEST, dict[str, Any], f"disco-twin reconstruct --out {folder.root}")
+    if asked != json.loads(json.dumps(pipeline_inputs(scene, tuple(made)))):
+        return "the scene's [reconstruct] or [relight] has changed since the latest reconstruct"
+    return None

@@ -1,0 +1,302 @@
+"""The run folder: where things lie, whose scene it is, and which stages are finished (so that a run can resume).
+
+OUT/scene.toml  run.log  stages.json  summary.json  report.html
+OUT/capture/    all that the pipeline reads        OUT/work/   the pipeline's outputs
+OUT/twin/       what the pipeline never sees: the simulated responses, true R_d, references
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import logging
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from hw.base.config import Strict, as_table, read_json
+from hw.base.errors import DiscoError, InputError
+from hw.base.resources import measured
+from pipeline.stream.files import IMAGES, JOURNAL
+
+log = logging.getLogger(__name__)
+
+FORMAT_VERSION = 2
+FOLDERS = ("capture", "twin", "work")
+
+
+def require_folder(folder: Path, option: str) -> None:
+    """Make the folder that an option names, and see that it can be written to."""
+    remedy = f"choose another {option}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return
+    except (FileExistsError, NotADirectoryError) as error:
+        raise InputError("a file is in its place", file=folder, key=option, remedy=remedy) from error
+    except OSError as error:
+        problem = f"cannot be written to ({(error.strerror or str(error)).lower()})"
+        raise InputError(problem, file=folder, key=option, remedy=remedy) from error
+
+
+@dataclass
+class StageRecord:
+    """A stage's inputs as a key, and what it took. Seconds add up over interruptions; the peak is the largest.
+
+    outputs: BLAKE2 digest of each file that the finished stage left, by its path in the run folder.
+    """
+
+    name: str
+    key: str
+    seconds: float = 0.0
+    peak_mb: float = 0.0
+    finished: bool = False
+    outputs: dict[str, str] = field(default_factory=dict)
+
+    def damaged(self, root: Path) -> str | None:
+        """The first of the files that is no longer what the stage left; None if all are."""
+        for path, digest in self.outputs.items():
+            if not (root / path).is_file() or file_digest(root / path) != digest:
+                return path
+        return None
+
+
+@dataclass
+class RunFolder:
+    """One run's folder. `identity` says which scene's capture it holds."""
+
+    root: Path
+    identity: str = ""
+    stages: dict[str, StageRecord] = field(default_factory=dict)
+
+    @property
+    def scene_file(self) -> Path:
+        return self.root / "scene.toml"
+
+    @property
+    def capture(self) -> Path:
+        return self.root / "capture"
+
+    @property
+    def devices_record(self) -> Path:
+        """The rig file of a capture by devices."""
+        return self.capture / "devices.toml"
+
+    @property
+    def taken_by_devices(self) -> bool:
+        """Whether devices took this folder's images: nothing simulates them again or removes them."""
+        return self.devices_record.is_file()
+
+    @property
+    def twin(self) -> Path:
+        return self.root / "twin"
+
+    @property
+    def work(self) -> Path:
+        return self.root / "work"
+
+    @property
+    def journal(self) -> Path:
+        return self.root / "stages.json"
+
+    @property
+    def summary_file(self) -> Path:
+        return self.root / "summary.json"
+
+    @property
+    def report_file(self) -> Path:
+        return self.root / "report.html"
+
+    @classmethod
+    def open(cls, root: Path) -> RunFolder:
+        """An existing run folder."""
+        folder = cls(root)
+        if not folder.journal.is_file():
+            raise InputError("is no run folder", file=root, remedy="give the --out folder of `disco-twin run`")
+        folder._load()
+        return folder
+
+    @classmethod
+    def claim(cls, root: Path, scene_file: Path, identity: str) -> RunFolder:
+        """The folder for this scene: made, or resumed; a folder that holds anything else is refused."""
+        folder = cls(root, identity)
+        if root.exists() and not root.is_dir():
+            raise InputError("is not a folder", file=root, remedy="choose another --out")
+        if folder.journal.is_file():
+            folder._load_or_begin_anew(identity)
+            if folder.identity != identity:
+                raise InputError(
+                    "the folder holds the run of another scene or profile, or the scene has changed since",
+                    file=root,
+                    remedy="choose another --out, or delete this one",
+                )
+        elif root.is_dir() and not _barely_begun(root):
+            raise InputError("the folder is not empty and holds no run", file=root, remedy="choose another --out")
+        folder.identity = identity
+        for path in (folder.capture, folder.twin, folder.work):
+            path.mkdir(parents=True, exist_ok=True)
+        with folder.alone():
+            write_atomically(folder.scene_file, scene_file.read_bytes())
+            folder._save()
+        return folder
+
+    def run(self, name: str, key: str, work: Callable[[], float | None], outputs: Sequence[str] = ()) -> bool:
+        """Do a stage unless it is finished under the same key; True if it was done now.
+
+        outputs: patterns of the files that it leaves; where one is missing or cut later, the stage is done again.
+        `work` may return the peak memory in MiB of a process of its own, which then counts as the stage's.
+        """
+        with self.alone():
+            if self.journal.is_file():
+                self._load()  # another process may have worked here since
+            record = self.stages.get(name)
+            if record is not None and record.key == key and record.finished:
+                path = record.damaged(self.root)
+                if path is None:
+                    return False
+                log.warning("%s: %s is missing or damaged, the stage is done again", name, path)
+                record = None
+            if record is None or record.key != key:
+                record = StageRecord(name, key)
+            self.stages[name] = record
+            self._save()  # whatever ends this process from here on, the files are no longer those of a finished stage
+            self._work(record, work, outputs)
+        return True
+
+    def _work(self, record: StageRecord, work: Callable[[], float | None], outputs: Sequence[str]) -> None:
+        """Do a stage and write down what it took, whether it comes to its end or not."""
+        child: float | None = None
+        usage = None
+        try:
+            with measured() as usage:
+                child = work()
+            record.finished = True
+            files = [path for pattern in outputs for path in self.root.glob(pattern) if path.is_file()]
+            record.outputs = {str(path.relative_to(self.root)): file_digest(path) for path in files}
+        finally:
+            if usage is not None:
+                record.seconds += usage.seconds
+                record.peak_mb = max(record.peak_mb, usage.peak_mb if child is None else child)
+            self._save()
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """No other process works in the folder meanwhile."""
+        handle = os.open(self.root, os.O_RDONLY)
+        try:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise DiscoError(
+                    f"{self.root}: another process works in this folder. Remedy: wait for it, or choose another --out"
+                ) from error
+            yield
+        finally:
+            os.close(handle)
+
+    def _load(self) -> None:
+        data = read_json(self.journal, _Journal, "choose another --out")
+        self.identity = data.identity
+        self.stages = {record.name: record for record in data.stages}
+
+    def _load_or_begin_anew(self, identity: str) -> None:
+        """A journal that cannot be read is begun anew: what stages left is looked at again, nothing is lost.
+
+        Light that other code or another scene made is known by its own key (twin/light.key).
+        """
+        try:
+            self._load()
+        except InputError as error:
+            if _of_another_version(self.journal):
+                raise
+            kept = self.journal.with_suffix(".damaged")
+            log.warning("%s; it is kept as %s, and every stage is looked at again", error, kept.name)
+            self.journal.replace(kept)
+            self.identity = identity
+
+    def _save(self) -> None:
+        data = {
+            "format_version": FORMAT_VERSION,
+            "identity": self.identity,
+            "stages": [asdict(s) for s in self.stages.values()],
+        }
+        write_atomically(self.journal, json.dumps(data, indent=1).encode())
+
+
+class _Journal(Strict):
+    """stages.json."""
+
+    format_version: Literal[2]
+    identity: str
+    stages: tuple[Annotated[StageRecord, as_table(StageRecord)], ...]
+
+
+def _of_another_version(journal: Path) -> bool:
+    """Whether the journal can be read, and says that other code wrote it."""
+    try:
+        return bool(json.loads(journal.read_bytes()).get("format_version", FORMAT_VERSION) != FORMAT_VERSION)
+    except (ValueError, AttributeError):
+        return False
+
+
+def file_digest(path: Path) -> str:
+    """BLAKE2 of a file's content; of the stream the size, since each of its images has a checksum of its own."""
+    if path.name in (IMAGES, JOURNAL):
+        return f"{path.stat().st_size} bytes"
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, hashlib.blake2b).hexdigest()
+
+
+def _barely_begun(root: Path) -> bool:
+    """Whether a folder without a journal is one that a run could not finish making (a full disk, a kill), or empty."""
+    files = {"scene.toml", "scene.toml.part", "stages.json.part"}
+    return all(path.name in files or (path.name in FOLDERS and not any(path.iterdir())) for path in root.iterdir())
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file as a whole: a reader, or a run after a crash, sees the old content or the new.
+
+    Where the disk refuses, the error names the file, and nothing is left of what was not written in full.
+    """
+    temporary = path.with_name(path.name + ".part")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def content_key(*parts: Any) -> str:
+    """SHA-256 over the parts: text, bytes, files (their content), or anything that JSON can hold."""
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, Path):
+            data = part.read_bytes()
+        elif isinstance(part, bytes):
+            data = part
+        else:
+            data = (part if isinstance(part, str) else json.dumps(part, sort_keys=True)).encode()
+        digest.update(len(data).to_bytes(8, "little"))
+        digest.update(data)
+    return digest.hexdigest()
+
+
+def source_key(package: str) -> str:
+    """Key of a package's source code: a method developer's change makes its stage run again."""
+    from importlib.util import find_spec
+
+    spec = find_spec(package)
+    if spec is None or spec.origin is None:
+        raise InputError(f"the package {package} is not installed", remedy="make install")
+    origin = Path(spec.origin)
+    files = sorted(origin.parent.rglob("*.py")) if origin.name == "__init__.py" else [origin]
+    return content_key(*files)

@@ -1,0 +1,98 @@
+"""`disco-twin capture SCENE --rig rig.toml`: the capture by the devices of a rig file; the swap is this one word.
+
+The folder keeps the rig file, and knows by it that devices took its images: nothing simulates or removes them later,
+and no other rig continues them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from disco_twin.emulation.connect import assembled
+from disco_twin.emulation.rig_file import EMULATED, DevicesFile
+from disco_twin.emulation.rig_rules import load_rig_file, require_reach, require_same, require_scene
+from disco_twin.experiment.run_folder import content_key, require_folder, write_atomically
+from hw.base.errors import InputError, naming
+from pipeline.capture.loop import capture
+from pipeline.stream.files import IMAGES
+from pipeline.stream.stream import StreamReader
+
+if TYPE_CHECKING:
+    from disco_twin.emulation.twin_rig import TwinRig
+    from disco_twin.run.progress import Report
+    from disco_twin.run.stages import Run
+
+
+def open_rig_file(run: Run, path: Path, armed: bool) -> DevicesFile:
+    """Read a rig file for a run; real lasers need to be armed explicitly."""
+    file = load_rig_file(path)
+    require_scene(file, run.scene.rig, path)
+    if file.real_lasers and not armed:
+        ports = ", ".join(laser.port for laser in file.lasers if laser.port != EMULATED)
+        raise InputError(
+            f"real lasers will emit ({ports})",
+            file=path,
+            remedy="see to interlock, door and goggles, then repeat the command with --arm",
+        )
+    require_reach(file, run.experiment.plan, path)
+    folder = run.folder
+    if (folder.capture / IMAGES).exists() and not folder.taken_by_devices:
+        raise InputError("this folder holds a simulated capture", file=folder.root, remedy="choose another --out")
+    if _has_images(folder.capture):
+        require_same(file, _begun_with(folder.devices_record), path)
+    return file
+
+
+def _begun_with(record: Path) -> DevicesFile:
+    """The rig file that a capture keeps."""
+    try:
+        return load_rig_file(record)
+    except InputError as error:
+        remedy = "put the rig file there that the capture was begun with, or choose another --out"
+        problem = f"the capture's own copy of its rig file cannot be used ({error.problem})"
+        raise InputError(problem, file=record, key=error.key, value=error.value, remedy=remedy) from error
+
+
+def _has_images(folder: Path) -> bool:
+    """Before the first image the rig file may still be corrected."""
+    if not (folder / IMAGES).exists():
+        return False
+    with StreamReader(folder) as stored:
+        return len(stored) > 0
+
+
+def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool) -> None:
+    """Scan and capture; continues where it was interrupted, if the rig is the same and has not moved since."""
+    from disco_twin.run import simulate
+
+    file, experiment, folder = open_rig_file(run, path, armed), run.experiment, run.folder
+    if logs is not None:
+        require_folder(logs, "--logs")
+    if not _has_images(folder.capture):  # what the images are begun with is kept
+        write_atomically(folder.devices_record, path.read_bytes())
+    real = None if file.sensor is None or file.simulated_cameras else file.sensor.sensor()
+    sensor = simulate.sensor_of(experiment, real)
+    key = content_key(folder.identity, "devices")
+    scan_key = content_key(key, repr(sensor))  # the sensor may be corrected before the first image
+    run.stage("scan", scan_key, lambda _: simulate.write_scan(experiment, folder.capture, real))
+
+    def take_images(report: Report) -> None:
+        with naming(path), assembled(file, run.scene.rig, _twin(run, file), logs, armed=armed) as rig:
+            capture(rig, experiment.plan, folder.capture, report, sensor)
+
+    run.stage("capture", key, take_images, "images")
+
+
+def _twin(run: Run, file: DevicesFile) -> TwinRig | None:
+    """What simulated cameras look at; emulated devices without one need no light."""
+    from disco_twin.emulation.served_rig import Darkness
+    from disco_twin.emulation.twin_rig import TwinRig
+
+    if file.simulated_cameras:
+        from disco_twin.run.simulate import twin_rig
+
+        return twin_rig(run.experiment, run.folder)
+    if EMULATED in file.ports().values():
+        return TwinRig(run.scene.rig, Darkness(), run.scene.seed)
+    return None

@@ -1,0 +1,224 @@
+"""The twin's stages of a run: scan, capture, ground truth, references. Each writes its files into the run folder."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from disco_twin.experiment.experiment import Experiment, reference_key
+from disco_twin.experiment.run_folder import RunFolder, write_atomically
+from hw.base.errors import InputError
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.nominal_rig import CameraConfig, FaultsConfig
+from pipeline.plan.visibility import require_in_sight
+from pipeline.records import RigFile, SensorFile
+from pipeline.relight.lights import Light
+
+if TYPE_CHECKING:
+    from disco_twin.emulation.twin_rig import TwinRig
+    from disco_twin.light.truth import Truth
+    from hw.record import Sensor
+    from pipeline.capture.loop import CaptureReport
+
+log = logging.getLogger(__name__)
+
+Progress = Callable[[int, int], None]  # done, total
+COLUMNS_AT_ONCE = 4  # columns of truth between two words on the progress
+
+
+def sensor_of(experiment: Experiment, real: Sensor | None = None) -> Sensor:
+    """What the pipeline is told of the sensor: a real camera's, or the twin's."""
+    from disco_twin.camera.lars3 import lars3_sensor
+
+    return lars3_sensor(experiment.scene.rig) if real is None else real
+
+
+def write_scan(experiment: Experiment, capture: Path, sensor: Sensor | None = None) -> None:
+    """The nominal rig, its sensor, the scanned mesh: what the pipeline is told beside the images and their plan."""
+    require_capturable(experiment)
+    write_atomically(capture / "scan.ply", bytes(experiment.scan.export(file_type="ply")))
+    told = experiment.scene.rig.model_copy(update={"faults": FaultsConfig()})  # the twin's secret
+    known = SensorFile(format_version=1, sensor=sensor_of(experiment, sensor))
+    write_atomically(capture / "rig.json", RigFile(format_version=1, rig=told).model_dump_json(indent=1).encode())
+    write_atomically(capture / "sensor.json", known.model_dump_json(indent=1).encode())
+
+
+def require_capturable(experiment: Experiment) -> None:
+    """Refuse a scene whose devices do not reach the object, before anything is simulated."""
+    _require_equal_sizes(experiment.scene.rig.cameras, "rig.cameras")
+    for i, view in enumerate(experiment.scene.relight.views):
+        require_in_sight(view, experiment.scan, f"relight.views[{i}]", f"the held-out view {view.name!r}")
+    experiment.plan  # noqa: B018 - the plan refuses cameras, projector and spots that cannot be
+    from pipeline.calibrate.projector_fit import LEAST_SPOTS
+
+    rig = experiment.scene.rig
+    if rig.faults.deviation and rig.spots < LEAST_SPOTS:
+        raise InputError(
+            "too few to find the projector from, and the rig is off the nominal one", key="rig.spots", value=rig.spots,
+            allowed=f"at least {LEAST_SPOTS} that a camera sees", remedy="more spots, or --no-faults",
+        )  # fmt: skip
+
+
+def _require_equal_sizes(cameras: Sequence[CameraConfig], key: str) -> None:
+    sizes = {(c.width, c.height) for c in cameras}
+    if len(sizes) > 1:
+        remedy = "give all of them one width and height"
+        raise InputError("the twin's cameras must have one image size", key=key, value=sorted(sizes), remedy=remedy)
+
+
+def _later(progress: Progress, before: int, total: int, done: int, _: int) -> None:
+    """One of several captures as a part of the whole."""
+    progress(before + done, total)
+
+
+def take_targets(experiment: Experiment, folder: RunFolder, progress: Progress) -> None:
+    """The calibration images, camera by camera, into the capture's folder; continues where it was interrupted."""
+    from disco_twin.camera.targets import TargetSource
+    from disco_twin.emulation.twin_rig import BracketRig, TargetRig
+    from disco_twin.faults.actual_rig import actual_rig
+    from pipeline.capture.loop import capture
+    from pipeline.plan.targets import BRACKET, FOLDER, TARGETS, make_bracket, make_targets
+
+    rig, seed = experiment.scene.rig, experiment.scene.seed
+    actual, made = actual_rig(rig, seed), [make_targets(rig, c) for c in range(len(rig.cameras))]
+    total, before = sum(len(plan) for _, plan in made), 0
+    for c, (targets, plan) in enumerate(made):
+        own = folder.capture / FOLDER / targets.camera
+        own.mkdir(parents=True, exist_ok=True)
+        source = TargetSource(targets, actual.cameras[c], actual, rig.projector.beam_diameter_mm / 2)
+        twin = TargetRig(rig, source, seed, actual, c, len(targets.placements))
+        capture(twin, plan, own, partial(_later, progress, before, total))
+        if rig.sensor.response == "curved":
+            still, exposures = make_bracket(rig, c)
+            source = TargetSource(still, actual.cameras[c], actual, rig.projector.beam_diameter_mm / 2)
+            capture(BracketRig(rig, source, seed, actual, c, len(exposures.angles_rad)), exposures, own / BRACKET)
+        write_atomically(own / TARGETS, targets.model_dump_json(indent=1).encode())
+        before += len(plan)
+
+
+def twin_rig(experiment: Experiment, folder: RunFolder) -> TwinRig:
+    """The twin of the rig in front of the object. Needs the renderer."""
+    transport = experiment.transport
+    from disco_twin.emulation.twin_rig import TwinRig
+    from disco_twin.faults.actual_rig import actual_rig
+    from disco_twin.light.response import SpotResponses
+
+    scene = experiment.scene
+    actual = actual_rig(scene.rig, scene.seed)
+    walks, scratch = scene.simulation.walks_per_spot, folder.twin / "responses"
+    responses = SpotResponses(transport, scene.rig, actual, walks, experiment.seed("spots"), scratch)
+    return TwinRig(scene.rig, responses, scene.seed, actual)
+
+
+def take_images(experiment: Experiment, folder: RunFolder, progress: Progress) -> CaptureReport:
+    """The capture by the twin of the rig; continues where it was interrupted."""
+    from pipeline.capture.loop import capture
+
+    return capture(twin_rig(experiment, folder), experiment.plan, folder.capture, progress)
+
+
+def compute_truth(experiment: Experiment, path: Path, progress: Progress) -> None:
+    """Columns of the true R_d, from photons of their own."""
+    columns, walks = experiment.truth_columns(), experiment.scene.simulation.truth_walks
+    parts = []
+    for low in range(0, len(columns), COLUMNS_AT_ONCE):
+        part = columns[low : low + COLUMNS_AT_ONCE]
+        parts.append(experiment.truth(part, walks))
+        progress(low + len(part), len(columns))
+    joined(parts).save(path)
+
+
+def joined(parts: Sequence[Truth]) -> Truth:
+    """Truth of several sets of columns as one; the balance is the mean over columns."""
+    from disco_twin.light.balance import EnergyBalance
+    from disco_twin.light.truth import Truth
+
+    weights = [len(p.columns) for p in parts]
+    names = EnergyBalance.__dataclass_fields__
+    mean = {k: np.average([getattr(p.balance, k) for p in parts], axis=0, weights=weights) for k in names}
+    return Truth(
+        np.concatenate([p.columns for p in parts]),
+        np.concatenate([p.mean for p in parts], axis=1),
+        np.concatenate([p.standard_error for p in parts], axis=1),
+        parts[0].area,
+        EnergyBalance(**mean),
+    )
+
+
+def reference_path(folder: Path, light: Light, view: CameraConfig) -> Path:
+    """Where the reference of a light and view lies in a folder of references."""
+    return folder / f"{light.name}@{view.name}.exr"
+
+
+def shipped_references(scene_file: Path, name: str) -> Path:
+    """References that are committed beside a shipped scene."""
+    return scene_file.parent / "references" / name
+
+
+def holds_reference(folder: Path, experiment: Experiment, light: Light, view: CameraConfig) -> bool:
+    """Whether a folder holds this scene's reference of a light and view, with walks enough."""
+    from disco_twin.light.references import load_reference
+
+    path = reference_path(folder, light, view)
+    if not path.is_file():
+        return False
+    try:
+        found = load_reference(path)
+    except InputError as error:
+        log.warning("%s", error)
+        return False
+    walks = experiment.scene.simulation.reference_walks
+    return found.key == reference_key(experiment.scene, light, view) and found.walks >= walks // 2
+
+
+def render_references(experiment: Experiment, shipped: Path, own: Path, progress: Progress) -> int:
+    """Make sure that every reference lies in `own`: taken from `shipped`, kept from before, or rendered now.
+
+    Returns how many lights had to be rendered.
+    """
+    from disco_twin.light.references import save_reference
+
+    scene, rendered = experiment.scene, 0
+    lights = scene.relight.lights
+    if own.exists() and not own.is_dir():
+        raise InputError("is not a folder", file=own, remedy="choose another --out")
+    own.mkdir(parents=True, exist_ok=True)
+
+    for done, light in enumerate(lights):
+        progress(done, len(lights))
+        missing = []
+        for view in scene.relight.views:
+            name = reference_path(own, light, view)
+            if holds_reference(own, experiment, light, view):
+                continue
+            if holds_reference(shipped, experiment, light, view):
+                write_atomically(name, reference_path(shipped, light, view).read_bytes())
+            else:
+                missing.append(view)
+        for size in sorted({(v.width, v.height) for v in missing}):
+            views = [v for v in missing if (v.width, v.height) == size]
+            _render(experiment, light, views, own, save_reference)
+        rendered += bool(missing)
+    progress(len(lights), len(lights))
+    return rendered
+
+
+def _render(
+    experiment: Experiment, light: Light, views: Sequence[CameraConfig], own: Path, save: Callable[..., None]
+) -> None:
+    transport = experiment.transport
+    from disco_twin.light.references import render_reference
+
+    cameras = [PinholeCamera.from_config(v) for v in views]
+    walks, seed = experiment.scene.simulation.reference_walks, experiment.seed(f"reference {light.name}")
+    for view, image in zip(views, render_reference(transport, light, cameras, walks, seed), strict=True):
+        path = reference_path(own, light, view)
+        partial = path.with_name(f"part-{path.name}")
+        save(partial, replace(image, key=reference_key(experiment.scene, light, view)))
+        partial.replace(path)

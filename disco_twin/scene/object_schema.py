@@ -1,0 +1,233 @@
+"""The schema of `[object]` in a scene: shape, boundary, medium. Object frame, mm, wavelengths in the rig's order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field, field_validator, model_validator
+
+from disco_twin.object.materials import MATERIALS
+from hw.base.config import NearbyFile, Strict
+from pipeline.geometry.nominal_rig import Point, Positive
+
+
+def _not_zero(vector: Point) -> Point:
+    if not any(vector):
+        raise ValueError("a direction cannot be zero")
+    return vector
+
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Coefficient = Annotated[float, Field(ge=0, le=1e4)]
+PerWavelength = Coefficient | tuple[Coefficient, ...]  # one value for all lasers, or one a laser
+Albedo = Share | tuple[Share, ...]
+Asymmetry = Annotated[float, Field(gt=-1, lt=1)]
+Direction = Annotated[Point, AfterValidator(_not_zero)]  # of any length
+Size = tuple[Positive, Positive, Positive]
+
+
+# ---------------------------------------------------------------- shape
+class MeshFile(Strict):
+    """A closed, outward oriented triangle mesh in mm (PLY, OBJ or STL), placed with its own coordinates."""
+
+    kind: Literal["mesh"]
+    file: NearbyFile
+
+
+class Pebble(Strict):
+    """A smooth stone with bumps and two concave dents, scaled to a bounding box that is centred on the origin."""
+
+    kind: Literal["pebble"]
+    size_mm: Size = (40.0, 36.0, 32.0)
+    seed: Annotated[int, Field(ge=0)] = 1
+
+
+class Sphere(Strict):
+    """A sphere around the origin."""
+
+    kind: Literal["sphere"]
+    radius_mm: Positive = 20.0
+
+
+class Box(Strict):
+    """A box around the origin, or a slab where one side is short."""
+
+    kind: Literal["box"]
+    size_mm: Size
+
+
+class Torus(Strict):
+    """A ring around the turntable's axis: not star shaped, and it sees itself."""
+
+    kind: Literal["torus"]
+    ring_radius_mm: Positive = 14.0
+    tube_radius_mm: Positive = 6.0
+
+    @model_validator(mode="after")
+    def _open_ring(self) -> Torus:
+        if self.tube_radius_mm >= self.ring_radius_mm:
+            raise ValueError("tube_radius_mm must be smaller than ring_radius_mm, the ring would cut itself")
+        return self
+
+
+Shape = Annotated[MeshFile | Pebble | Sphere | Box | Torus, Field(discriminator="kind")]
+
+
+# ---------------------------------------------------------------- boundary
+class BoundaryConfig(Strict):
+    """Surface of the object: a dielectric of index `eta`, microfacet roughness `alpha` (GGX), or no boundary at all."""
+
+    kind: Literal["rough", "matched"] = "rough"
+    eta: Annotated[float, Field(ge=1, le=3)] = 1.3
+    alpha: Annotated[float, Field(ge=0.02, le=1)] = 0.3
+
+    @field_validator("kind", mode="before")
+    @classmethod
+    def _seen_by_a_camera(cls, kind: object) -> object:
+        if kind == "smooth":
+            raise ValueError("no walk connects to a camera through a smooth boundary; take 'rough' with alpha = 0.02")
+        return kind
+
+
+# ---------------------------------------------------------------- medium: what fills the object before features
+class Homogeneous(Strict):
+    """The same everywhere."""
+
+    kind: Literal["homogeneous"]
+    sigma_t_per_mm: PerWavelength
+    albedo: Albedo
+
+
+class Material(Strict):
+    """A measured material by name, as sigma_s' and sigma_a: it is meant with g = 0."""
+
+    kind: Literal["material"]
+    name: str
+
+    @model_validator(mode="after")
+    def _known(self) -> Material:
+        if self.name not in MATERIALS:
+            raise ValueError(f"unknown material {self.name!r}, choose one of {', '.join(MATERIALS)}")
+        return self
+
+
+class Grid(Strict):
+    """Voxels from files: `.npy` (nz, ny, nx) or (lasers, nz, ny, nx), or Mitsuba's `.vol`.
+
+    The corners are those of the outermost cells. A `.vol` file brings its own corners unless they are given here.
+    """
+
+    kind: Literal["grid"]
+    sigma_t_file: NearbyFile  # 1/mm
+    albedo_file: NearbyFile | None = None
+    albedo: Albedo | None = None
+    low_mm: Point | None = None
+    high_mm: Point | None = None
+
+    @model_validator(mode="after")
+    def _one_albedo(self) -> Grid:
+        if (self.albedo is None) == (self.albedo_file is None):
+            raise ValueError("give exactly one of albedo and albedo_file")
+        if (self.low_mm is None) != (self.high_mm is None):
+            raise ValueError("give both low_mm and high_mm, or neither")
+        return self
+
+
+Base = Annotated[Homogeneous | Material | Grid, Field(discriminator="kind")]
+
+
+# ---------------------------------------------------------------- medium: features laid over the base, in order
+class Veins(Strict):
+    """Thin wavy sheets, like the veins of marble: a foam of cells `spacing_mm` wide with walls `width_mm` thick."""
+
+    kind: Literal["veins"]
+    sigma_t_per_mm: PerWavelength
+    albedo: Albedo
+    spacing_mm: Positive = 12.0
+    width_mm: Positive = 1.5
+    seed: Annotated[int, Field(ge=0)] = 1
+
+
+class Crack(Strict):
+    """A disc-shaped, slightly wavy sheet. With `sigma_t_per_mm = 0` it is a gap (of the object's own index)."""
+
+    kind: Literal["crack"]
+    sigma_t_per_mm: PerWavelength
+    albedo: Albedo = 0.0
+    through_mm: Point = (0.0, 0.0, 0.0)
+    normal: Direction = (1.0, 0.0, 0.0)
+    radius_mm: Positive = 10.0
+    width_mm: Positive = 0.6
+    waviness_mm: Annotated[float, Field(ge=0)] = 0.5
+
+
+class Layers(Strict):
+    """Parallel layers: within each period along `direction`, the first `share` is this material."""
+
+    kind: Literal["layers"]
+    sigma_t_per_mm: PerWavelength
+    albedo: Albedo
+    direction: Direction = (0.0, 0.0, 1.0)
+    period_mm: Positive
+    share: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    offset_mm: float = 0.0
+
+
+class HollowCore(Strict):
+    """An empty ball: light crosses it unchanged (its index is the object's own, it has no surface)."""
+
+    kind: Literal["hollow"]
+    centre_mm: Point = (0.0, 0.0, 0.0)
+    radius_mm: Positive
+
+
+class Patch(Strict):
+    """Opaque paint: the part of a ball around a surface point that lies less than `depth_mm` below the surface."""
+
+    kind: Literal["patch"]
+    sigma_t_per_mm: PerWavelength = 10.0
+    albedo: Albedo = 0.2
+    centre_mm: Point  # the surface point nearest to it is painted
+    radius_mm: Positive = 5.0
+    depth_mm: Positive = 1.0
+
+
+Feature = Annotated[Veins | Crack | Layers | HollowCore | Patch, Field(discriminator="kind")]
+
+
+class MediumConfig(Strict):
+    """`base` with `features` laid over it in order.
+
+    `cell_mm` is the edge of the voxels that features are sampled on; a grid base keeps its own voxels.
+    """
+
+    base: Base
+    features: Annotated[tuple[Feature, ...], Field(max_length=32)] = ()
+    g: Asymmetry | tuple[Asymmetry, ...] = 0.0
+    cell_mm: Annotated[float, Field(ge=0.02, le=10)] = 0.5
+
+    @model_validator(mode="after")
+    def _reduced(self) -> MediumConfig:
+        if isinstance(self.base, Material) and np.any(self.g):
+            raise ValueError("a measured material states reduced scattering, it needs g = 0")
+        return self
+
+    def per_wavelength(self) -> Iterator[tuple[str, tuple[float, ...]]]:
+        """Keys and values of everything that is given once a laser."""
+        parts: list[tuple[str, Strict]] = [("", self), ("base.", self.base)]
+        parts += [(f"features[{i}].", feature) for i, feature in enumerate(self.features)]
+        for prefix, part in parts:
+            for name in ("sigma_t_per_mm", "albedo", "g"):
+                value = getattr(part, name, None)
+                if isinstance(value, tuple):
+                    yield prefix + name, value
+
+
+class ObjectConfig(Strict):
+    """The scanned object."""
+
+    shape: Shape
+    boundary: BoundaryConfig = BoundaryConfig()
+    medium: MediumConfig

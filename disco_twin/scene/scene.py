@@ -1,0 +1,138 @@
+"""A scene: one TOML file that says what is simulated, captured, reconstructed and relit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+
+from disco_twin.scene.object_schema import ObjectConfig
+from hw.base.config import Strict, load_toml
+from pipeline.geometry.nominal_rig import CameraConfig, FaultsConfig, RigConfig
+from pipeline.reconstruct.settings import ReconstructConfig
+from pipeline.relight.lights import Colour, Light, shipped_lights
+
+Count = Annotated[int, Field(ge=1, lt=2**32)]  # photons are numbered in 32 bits
+Profile = Literal["full", "small"]
+
+
+MOST_VERTICES = 20_000  # R_d holds vertices^2 entries a laser, with their variance: 3.2 GB each at this size
+
+
+def _storable(vertices: int) -> int:
+    if vertices > MOST_VERTICES:
+        raise ValueError(f"R_d holds the square of that for every laser, at most {MOST_VERTICES} vertices fit")
+    return vertices
+
+
+class ScanConfig(Strict):
+    """The mesh that the pipeline is given: about `vertices` vertices, or (left out) the object's own mesh."""
+
+    vertices: Annotated[int, Field(ge=50), AfterValidator(_storable)] | None = None
+
+
+class SimulationConfig(Strict):
+    """How much light is traced; the noise goes with the inverse square root of the walks."""
+
+    walks_per_spot: Count = 200_000
+    truth_columns: Count = 24  # scan vertices whose column of R_d is computed as ground truth
+    truth_walks: Count = 500_000  # a column, with weight windows
+    reference_walks: Count = 20_000_000  # a light, both halves together
+
+
+class RelightConfig(Strict):
+    """What the model is tried on: held-out cameras in the object frame, and lights.
+
+    A light is a table or the name of a shipped one (those are placed by the first view); left out: all shipped ones.
+    """
+
+    views: Annotated[tuple[CameraConfig, ...], Field(min_length=2, max_length=16)]
+    lights: Annotated[tuple[Light, ...], Field(validate_default=True)] = ()
+
+    @field_validator("lights", mode="before")
+    @classmethod
+    def _by_name(cls, lights: Any, info: ValidationInfo) -> Any:
+        if "views" not in info.data or not isinstance(lights, list | tuple):
+            return lights  # reported as such
+        shipped = {light.name: light for light in shipped_lights(info.data["views"][0].position_mm)}
+        unknown = [light for light in lights if isinstance(light, str) and light not in shipped]
+        if unknown:
+            raise ValueError(f"unknown light {unknown[0]!r}, shipped are {', '.join(shipped)}")
+        return tuple(shipped[light] if isinstance(light, str) else light for light in lights or shipped)
+
+
+class Scene(Strict):
+    """Everything about one run."""
+
+    format_version: Literal[1]
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    object: ObjectConfig
+    scan: ScanConfig = ScanConfig()
+    rig: RigConfig
+    simulation: SimulationConfig = SimulationConfig()
+    reconstruct: ReconstructConfig = ReconstructConfig()
+    relight: RelightConfig
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Scene:
+        lasers = len(self.rig.lasers)
+        for key, values in self.object.medium.per_wavelength():
+            if len(values) not in (1, lasers):
+                raise ValueError(f"object.medium.{key} has {len(values)} values for {lasers} lasers")
+        for light in self.relight.lights:
+            if any(len(colour) != lasers for colour in _colours(light)):
+                raise ValueError(f"relight.lights: the colour of {light.name!r} needs {lasers} values, one a laser")
+        for what, names in (
+            ("relight.lights", [light.name for light in self.relight.lights]),
+            ("relight.views and rig.cameras", [c.name for c in (*self.rig.cameras, *self.relight.views)]),
+        ):
+            if len(set(names)) < len(names):
+                raise ValueError(f"{what}: names must be distinct, found {', '.join(names)}")
+        if self.scan.vertices is not None and self.simulation.truth_columns > self.scan.vertices / 2:
+            raise ValueError(
+                f"simulation.truth_columns = {self.simulation.truth_columns}: more than half of scan.vertices"
+            )
+        return self
+
+
+def _colours(light: Light) -> list[Colour]:
+    return [light.constant, *(lobe.radiance for lobe in light.lobes)] if light.kind == "environment" else [light.colour]
+
+
+def load_scene(path: str | Path, profile: Profile = "full", faults: bool | None = None) -> Scene:
+    """Read a scene; file names inside it are relative to its folder. `small` shrinks it, see `shrink`.
+
+    faults: every fault of the rig is on or off, whatever the scene says
+    """
+    scene = load_toml(path, Scene, others={"board": "a rig file", "turntable": "a rig file"})
+    if faults is not None:
+        all_of_them = FaultsConfig(**dict.fromkeys(FaultsConfig.model_fields, faults))
+        scene = scene.model_copy(update={"rig": scene.rig.model_copy(update={"faults": all_of_them})})
+    return shrink(scene) if profile == "small" else scene
+
+
+def shrink(scene: Scene) -> Scene:
+    """The profile `small`: the same scene with a quarter of the pixels and of the spots and a tenth of the walks.
+
+    At least 20 spots, 16 pixels, 4 columns of truth and 1000 walks are left; geometry and media stay as they are.
+    """
+
+    def half(camera: CameraConfig) -> CameraConfig:
+        width, height = max(16, camera.width // 2), max(16, camera.height // 2)
+        pitch = camera.pixel_pitch_um * camera.width / width
+        return camera.model_copy(update={"width": width, "height": height, "pixel_pitch_um": pitch})
+
+    walks = scene.simulation
+    simulation = SimulationConfig(
+        walks_per_spot=max(1000, walks.walks_per_spot // 10),
+        truth_columns=min(walks.truth_columns, max(4, walks.truth_columns // 4)),
+        truth_walks=max(1000, walks.truth_walks // 10),
+        reference_walks=max(1000, walks.reference_walks // 10),
+    )
+    cameras = tuple(half(camera) for camera in scene.rig.cameras)
+    spots = min(scene.rig.spots, max(20, scene.rig.spots // 4))
+    rig = scene.rig.model_copy(update={"cameras": cameras, "spots": spots})
+    relight = scene.relight.model_copy(update={"views": tuple(half(view) for view in scene.relight.views)})
+    return scene.model_copy(update={"rig": rig, "relight": relight, "simulation": simulation})

@@ -1,0 +1,1 @@
+"""Cameras of a real rig: exposure bracketing, GenICam cameras and their grabber."""

@@ -1,0 +1,274 @@
+"""Captures that were made without our software: a folder of 16-bit images, a table and a description -> our stream.
+
+FOLDER/capture.toml   `CaptureDescription`: the nominal rig as in a scene, what is known of the sensor, the scan's file
+FOLDER/images.csv     one line a frame, with the columns COLUMNS; frames that differ in exposure_s alone are a bracket
+FOLDER/...            the frames: 16-bit grey PNG or TIFF, raw digital numbers, black level included
+
+docs/lab.md has an example. Importing is repeatable: what is in the stream already is not read again.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import logging
+import math
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+from pydantic import Field
+
+from hw.base.config import NearbyFile, Strict, as_table, load_toml
+from hw.base.errors import InputError
+from hw.camera.bracket import Bracket
+from hw.interface import Aim
+from hw.record import Sensor
+from pipeline.geometry.nominal_rig import RigConfig
+from pipeline.plan.plan import ImageAddress, Plan
+from pipeline.records import RigFile, SensorFile
+from pipeline.stream.files import replace_file
+from pipeline.stream.layout import ImageMeta
+from pipeline.stream.stream import StreamWriter
+
+log = logging.getLogger(__name__)
+
+COLUMNS = ("file", "kind", "camera", "angle_deg", "u", "v", "laser_nm", "exposure_s", "power_w", "time_s")
+EXPOSURE_SHARE = 0.01  # by which an exposure may miss its power of two: as much is the radiance off
+ANGLE_DEG = 0.01
+WAVELENGTH_NM = 1.0
+
+
+class CaptureDescription(Strict):
+    """capture.toml."""
+
+    format_version: Literal[1]
+    scan: NearbyFile
+    saturation_dn: Annotated[int, Field(ge=1, le=65535)]  # linear below this
+    sensor: Annotated[Sensor, as_table(Sensor)]
+    rig: RigConfig
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One line of the table. exponent: halvings of the longest exposure."""
+
+    line: int
+    file: Path
+    exponent: int
+    power_w: float
+    time_s: float
+
+
+Key = tuple[int, int, int, int, int]  # camera, angle, u, v, laser; a silhouette has u = v = laser = -1
+
+
+def import_capture(folder: Path, out: Path, progress: Callable[[int, int], None] | None = None) -> Plan:
+    """Write the stream and what the pipeline is told with it into `out`; the plan that the images make up."""
+    described = load_toml(
+        folder / "capture.toml", CaptureDescription, "a capture.toml (docs/lab.md, section 6, shows one)"
+    )
+    table = folder / "images.csv"
+    brackets = _read_table(table, described)
+    plan = _plan(table, described.rig, brackets)
+    bracket = Bracket(
+        described.sensor.longest_exposure_s,
+        tuple(range(described.sensor.steps)),
+        described.sensor.bits,
+        described.saturation_dn,
+    )
+    with StreamWriter(out, plan) as stream:
+        replace_file(out / "scan.ply", _scan(described.scan))
+        replace_file(out / "rig.json", RigFile(format_version=1, rig=described.rig).model_dump_json(indent=1).encode())
+        replace_file(
+            out / "sensor.json",
+            SensorFile(format_version=1, sensor=described.sensor).model_dump_json(indent=1).encode(),
+        )
+        for index in range(len(stream), len(plan)):
+            address = plan.address(index)
+            frames = brackets[_key(plan, address)]
+            camera = described.rig.cameras[plan.camera_of(address.view)]
+            raw = bracket.merge(_pixels(table, frames, (camera.height, camera.width), bracket))
+            stream.append(address, raw, _meta(plan, address, frames))
+            if progress is not None:
+                progress(index + 1, len(plan))
+    return plan
+
+
+def _scan(path: Path) -> bytes:
+    mesh = trimesh.load(path, process=False)
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise InputError("holds no triangles", file=path, remedy="export the scan as PLY, OBJ or STL, in mm")
+    return bytes(mesh.export(file_type="ply"))
+
+
+# ---- the table
+
+
+def _read_table(path: Path, described: CaptureDescription) -> dict[Key, list[Frame]]:
+    """The frames of every image, by falling exposure."""
+    brackets: dict[Key, list[Frame]] = {}
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = csv.DictReader(file)
+            missing = [name for name in COLUMNS if name not in (rows.fieldnames or ())]
+            if missing:
+                raise InputError(f"has no column {missing[0]!r}", file=path, allowed=", ".join(COLUMNS))
+            for row in rows:
+                key, frame = _row(path, rows.line_num, row, described)
+                brackets.setdefault(key, []).append(frame)
+    except OSError as error:
+        raise InputError(
+            f"cannot be read ({error.strerror})", file=path, remedy="docs/lab.md has an example"
+        ) from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"is not a table ({error})", file=path, remedy="save it as CSV in UTF-8") from error
+    for frames in brackets.values():
+        frames.sort(key=lambda frame: frame.exponent)
+        for a, b in itertools.pairwise(frames):
+            if a.exponent == b.exponent:
+                problem = f"lines {a.line} and {b.line} are the same image with the same exposure"
+                raise InputError(problem, file=path, remedy="leave one of them out")
+    return brackets
+
+
+def _row(path: Path, line: int, row: dict[str, str], described: CaptureDescription) -> tuple[Key, Frame]:
+    rig, sensor = described.rig, described.sensor
+
+    def wrong(column: str, allowed: str) -> InputError:
+        return InputError(f"line {line} cannot be used", file=path, key=column, value=row[column], allowed=allowed)
+
+    def number(column: str, allowed: str) -> float:
+        try:
+            value = float(row[column])
+        except (TypeError, ValueError):
+            raise wrong(column, allowed) from None
+        if not math.isfinite(value):
+            raise wrong(column, allowed)
+        return value
+
+    names = [camera.name for camera in rig.cameras]
+    if row["camera"] not in names:
+        raise wrong("camera", ", ".join(names))
+    if row["kind"] not in ("silhouette", "spot"):
+        raise wrong("kind", "silhouette, spot")
+    angles = rig.turntable_angles_deg
+    angle = _nearest(number("angle_deg", "an angle"), angles, ANGLE_DEG, 360.0)
+    if angle is None:
+        raise wrong("angle_deg", ", ".join(f"{a:g}" for a in angles))
+    share = sensor.longest_exposure_s / max(number("exposure_s", "seconds"), 1e-12)
+    exponent = round(math.log2(share)) if share > 0 else -1
+    if not 0 <= exponent < sensor.steps or abs(share / 2.0**exponent - 1) > EXPOSURE_SHARE:
+        raise wrong("exposure_s", f"{sensor.longest_exposure_s:g} s / 2^k, k = 0 to {sensor.steps - 1}")
+    frame = Frame(line, path.parent / row["file"], exponent, 0.0, number("time_s", "seconds"))
+    camera = names.index(row["camera"])
+    if row["kind"] == "silhouette":
+        return (camera, angle, -1, -1, -1), frame
+    laser = _nearest(number("laser_nm", "nm"), [la.wavelength_nm for la in rig.lasers], WAVELENGTH_NM, math.inf)
+    if laser is None:
+        raise wrong("laser_nm", ", ".join(f"{la.wavelength_nm:g}" for la in rig.lasers))
+    top = rig.projector.steps - 1
+
+    def step(column: str) -> int:
+        value = number(column, f"0 to {top}")
+        if value != int(value) or not 0 <= value <= top:
+            raise wrong(column, f"whole steps, 0 to {top}")
+        return int(value)
+
+    u, v = step("u"), step("v")
+    power = number("power_w", "watts on the object, more than 0")
+    if power <= 0:
+        raise wrong("power_w", "watts on the object, more than 0")
+    return (camera, angle, u, v, laser), Frame(line, frame.file, exponent, power, frame.time_s)
+
+
+def _nearest(value: float, choices: tuple[float, ...] | list[float], tolerance: float, period: float) -> int | None:
+    """The choice that is meant."""
+    away = [
+        abs(math.remainder(value - choice, period)) if period < math.inf else abs(value - choice) for choice in choices
+    ]
+    best = min(range(len(choices)), key=away.__getitem__)
+    return best if away[best] <= tolerance else None
+
+
+def _plan(path: Path, rig: RigConfig, brackets: dict[Key, list[Frame]]) -> Plan:
+    """Spots in the order of the table, grouped by angle; every view must have all of its angle's, in all lasers."""
+    order: dict[tuple[int, int, int], None] = dict.fromkeys(key[1:4] for key in brackets if key[4] >= 0)
+    aims = tuple(Aim(*aim) for aim in sorted(order, key=lambda aim: aim[0]))  # stable
+    angles = tuple(float(a) for a in np.deg2rad(rig.turntable_angles_deg))
+    plan = Plan(tuple(camera.name for camera in rig.cameras), angles, aims, len(rig.lasers))
+    missing = [address for address in plan.addresses() if _key(plan, address) not in brackets]
+    if missing:
+        raise InputError(
+            f"{len(missing)} of {len(plan)} images are missing, the first is {_words(rig, plan, missing[0])}",
+            file=path,
+            remedy="every camera needs, at every angle, a silhouette and all spots in all lasers; leave incomplete "
+            "spots, cameras or angles out of images.csv and capture.toml",
+        )
+    return plan
+
+
+def _key(plan: Plan, address: ImageAddress) -> Key:
+    camera, angle = plan.camera_of(address.view), plan.angle_of(address.view)
+    if address.kind == "silhouette":
+        return (camera, angle, -1, -1, -1)
+    aim = plan.spots[address.spot]
+    return (camera, angle, aim.u, aim.v, address.laser)
+
+
+def _words(rig: RigConfig, plan: Plan, address: ImageAddress) -> str:
+    camera, angle, u, v, laser = _key(plan, address)
+    place = f"camera {rig.cameras[camera].name}, {rig.turntable_angles_deg[angle]:g} deg"
+    return place + (", silhouette" if laser < 0 else f", u {u}, v {v}, {rig.lasers[laser].wavelength_nm:g} nm")
+
+
+def _meta(plan: Plan, address: ImageAddress, frames: list[Frame]) -> ImageMeta:
+    """Power: the mean of the bracket's, by exposure; time: its last frame's."""
+    angle = plan.angles_rad[plan.angle_of(address.view)]
+    time_s = max(frame.time_s for frame in frames)
+    if address.kind == "silhouette":
+        return ImageMeta(time_s, 0.0, angle, -1, -1)
+    aim, weights = plan.spots[address.spot], [2.0**-frame.exponent for frame in frames]
+    power = float(np.average([frame.power_w for frame in frames], weights=weights))
+    return ImageMeta(time_s, power, angle, aim.u, aim.v)
+
+
+# ---- the frames
+
+
+def _pixels(
+    table: Path, frames: list[Frame], shape: tuple[int, int], bracket: Bracket
+) -> Iterator[tuple[int, NDArray[np.uint16]]]:
+    for frame in frames:
+        yield frame.exponent, read_frame(frame.file, shape, bracket.full_scale_dn, f"line {frame.line} of {table}")
+
+
+def read_frame(path: Path, shape: tuple[int, int], full_scale_dn: int, where: str) -> NDArray[np.uint16]:
+    """(height, width) digital numbers of a 16-bit grey image; anything else is refused."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # Pillow reads a damaged file as far as it gets
+            with Image.open(path) as image:
+                mode, pixels = image.mode, np.asarray(image)
+    except FileNotFoundError as error:
+        raise InputError(f"no such file ({where})", file=path, remedy="copy the frame there") from error
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError, UserWarning) as error:
+        raise InputError(f"not a readable image ({error})", file=path, remedy="16-bit grey PNG or TIFF") from error
+    if mode not in ("I;16", "I;16B", "I;16L", "I"):
+        raise InputError("is not 16-bit grey", file=path, value=mode, allowed="16-bit grey PNG or TIFF")
+    if pixels.shape != shape:
+        problem = f"has {pixels.shape[1]} x {pixels.shape[0]} pixels"
+        raise InputError(problem, file=path, allowed=f"the camera's {shape[1]} x {shape[0]}")
+    if pixels.min() < 0 or pixels.max() > full_scale_dn:
+        value = int(pixels.max() if pixels.max() > full_scale_dn else pixels.min())
+        remedy = "correct sensor.bits, or shift the values down if the camera fills the upper bits"
+        raise InputError(
+            "holds values beyond the sensor's", file=path, value=value, allowed=f"0 to {full_scale_dn}", remedy=remedy
+        )
+    return pixels.astype(np.uint16)

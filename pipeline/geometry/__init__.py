@@ -1,0 +1,1 @@
+"""Cameras, projector, meshes, rays and the boundary's transmittance: what a rig and an object are, in mm."""

@@ -1,0 +1,143 @@
+"""Pinhole camera with OpenCV's five-parameter distortion, in the object frame or any other.
+
+Conventions: the camera looks along +z of its own frame, x right, y down. Pixel (row r, column c) covers
+[c, c+1) x [r, r+1) of the image plane, its centre is (c + 1/2, r + 1/2); OpenCV's principal point is ours minus 1/2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hw.base.errors import InputError
+from pipeline.geometry.nominal_rig import CameraConfig
+
+F64 = NDArray[np.float64]
+
+
+def look_at(position: ArrayLike, aim: ArrayLike, up: ArrayLike = (0, 0, 1)) -> F64:
+    """(4, 4) transform world -> device for a device at `position` with +z towards `aim`, x right, y down.
+
+    A device that looks straight along `up` (within 1e-6 rad) takes +y as up instead, or +x where it looks along y.
+    """
+    eye = np.asarray(position, float)
+    forward = np.asarray(aim, float) - eye
+    distance = np.linalg.norm(forward)
+    if distance == 0:
+        raise InputError("position and aim are one point", value=position, remedy="aim at another point")
+    forward = forward / distance
+    upward = np.asarray(up, float)
+    right = np.cross(forward, upward)
+    if np.linalg.norm(right) <= 1e-6 * np.linalg.norm(upward):
+        right = np.cross(forward, [0.0, 1.0, 0.0] if abs(forward[1]) < 0.9 else [1.0, 0.0, 0.0])
+    right = right / np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
+    return pose
+
+
+def turn(angle_rad: float) -> F64:
+    """(4, 4) transform object -> world of a turntable at `angle_rad`, counter-clockwise from above."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """focal, centre: (2,) pixels; distortion: (5,) k1 k2 p1 p2 k3; pose: (4, 4) frame -> camera."""
+
+    width: int
+    height: int
+    focal: F64
+    centre: F64
+    distortion: F64
+    pose: F64
+
+    @classmethod
+    def from_config(cls, config: CameraConfig) -> PinholeCamera:
+        """The nominal camera in the world frame."""
+        focal = config.focal_length_mm / (config.pixel_pitch_um * 1e-3)
+        return cls(
+            config.width,
+            config.height,
+            np.array([focal, focal]),
+            np.array([config.width / 2, config.height / 2]),
+            np.array(config.distortion, float),
+            look_at(config.position_mm, config.aim_mm, config.up),
+        )
+
+    def seen_from(self, frame_to_here: F64) -> PinholeCamera:
+        """The same camera in another frame, given the (4, 4) transform from that frame to this one."""
+        return replace(self, pose=self.pose @ frame_to_here)
+
+    @property
+    def position(self) -> F64:
+        """(3,) centre of projection in the frame."""
+        return np.asarray(-self.pose[:3, :3].T @ self.pose[:3, 3])
+
+    def distort(self, xy: F64) -> F64:
+        """(N, 2) normalised coordinates -> distorted ones (OpenCV's rational model without the denominator)."""
+        k1, k2, p1, p2, k3 = self.distortion
+        x, y = xy[:, 0], xy[:, 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        return np.stack(
+            [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y],
+            axis=1,
+        )
+
+    def undistort(self, xy: F64) -> F64:
+        """Inverse of `distort` by Newton's method with a numerical Jacobian; exact to 1e-12 where it is invertible."""
+        if not self.distortion.any():
+            return xy
+        out = xy.copy()
+        for _ in range(20):
+            residual = self.distort(out) - xy
+            if np.abs(residual).max(initial=0.0) < 1e-13:
+                break
+            right, down = np.array([1e-6, 0.0]), np.array([0.0, 1e-6])
+            dx = (self.distort(out + right) - self.distort(out - right)) / 2e-6
+            dy = (self.distort(out + down) - self.distort(out - down)) / 2e-6
+            det = dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]
+            out[:, 0] -= (dy[:, 1] * residual[:, 0] - dy[:, 0] * residual[:, 1]) / det
+            out[:, 1] -= (dx[:, 0] * residual[:, 1] - dx[:, 1] * residual[:, 0]) / det
+        return out
+
+    def project(self, points: F64) -> tuple[F64, F64]:
+        """(N, 3) points of the frame -> (N, 2) pixel coordinates (x, y) and (N,) depth along +z in mm.
+
+        NaN for points far outside the picture that the distortion's polynomial would fold back into it.
+        """
+        local = points @ self.pose[:3, :3].T + self.pose[:3, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            xy = local[:, :2] / local[:, 2:]
+        pixels = self.distort(xy) * self.focal + self.centre
+        if any(self.distortion):
+            outside = np.linalg.norm(xy, axis=1) > 1.1 * self._reach
+            inside = ((pixels >= 0) & (pixels <= [self.width, self.height])).all(axis=1)
+            pixels[outside & inside] = np.nan
+        return pixels, local[:, 2]
+
+    @cached_property
+    def _reach(self) -> float:
+        """Of the picture's farthest corner, as the tangent of its angle off the axis."""
+        corners = np.array([[0, 0], [self.width, 0], [0, self.height], [self.width, self.height]], float)
+        return float(np.linalg.norm(self.undistort((corners - self.centre) / self.focal), axis=1).max())
+
+    def rays(self, pixels: F64) -> tuple[F64, F64]:
+        """(N, 2) pixel coordinates (x, y) -> (N, 3) origins and unit directions in the frame."""
+        xy = self.undistort((np.asarray(pixels, float) - self.centre) / self.focal)
+        local = np.column_stack([xy, np.ones(len(xy))])
+        local /= np.linalg.norm(local, axis=1, keepdims=True)
+        directions = local @ self.pose[:3, :3]
+        return np.broadcast_to(self.position, directions.shape).copy(), directions
+
+    def pixel_centres(self, supersample: int = 1) -> F64:
+        """(height * width * s^2, 2) sample positions, row by row, each pixel's s x s samples on the refined grid."""
+        x = (np.arange(self.width * supersample) + 0.5) / supersample
+        y = (np.arange(self.height * supersample) + 0.5) / supersample
+        return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

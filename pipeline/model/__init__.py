@@ -1,0 +1,1 @@
+"""What a reconstruction yields: a relightable model of the object, and its file."""

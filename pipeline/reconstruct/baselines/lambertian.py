@@ -1,0 +1,53 @@
+"""Baseline: an opaque surface. Light leaves where it enters; the albedo is a spot's total energy."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.fresnel import Boundary
+from pipeline.geometry.mesh import interpolation, vertex_areas
+from pipeline.model.reflectance import ReflectanceModel
+from pipeline.reconstruct.global_term.completion import MOST_HARMONICS, RANGE_EDGES, measured_entries
+from pipeline.reconstruct.global_term.harmonics import harmonics
+from pipeline.reconstruct.global_term.radial_profile import over_directions
+from pipeline.reconstruct.samples.samples import Samples
+
+F64 = NDArray[np.float64]
+
+ALBEDO_NOISE = 0.2  # of a spot's energy relative to its deviation from the mean, in the interpolation
+
+
+def spot_energies(samples: Samples, laser: int) -> F64:
+    """(S,) share of a spot's transmitted power that leaves again; NaN for spots not used.
+
+    What the cameras did not see of a spot is added in the proportion of the radial profile.
+    """
+    measured, profile = over_directions(samples, laser)
+    kernel = samples.spot_pairs.mean(profile)
+    area = vertex_areas(samples.mesh)
+    expected = (np.where(measured.observed, kernel, 0.0) * area).sum(axis=1)
+    seen = (measured.value * area).sum(axis=1)
+    whole = (kernel * area).sum(axis=1)
+    return np.where(expected > 0.3 * whole, seen * whole / np.maximum(expected, 1e-12), np.nan)
+
+
+def fit_lambertian(samples: Samples) -> ReflectanceModel:
+    """The baseline: samples -> model with R_d = albedo / area on the diagonal."""
+    area = vertex_areas(samples.mesh)
+    edge = float(samples.mesh.edges_unique_length.mean())
+    covariance = harmonics(samples.mesh, MOST_HARMONICS).covariance(RANGE_EDGES * edge)
+    to_spots = interpolation(samples.mesh, samples.spots.triangle, samples.spots.barycentric)
+    reflectance = np.zeros((len(samples.values), len(area), len(area)), np.float32)
+    for laser in range(len(samples.values)):
+        energy = spot_energies(samples, laser)
+        known = np.flatnonzero(np.isfinite(energy))
+        mean = float(energy[known].mean())
+        cross = to_spots[known] @ covariance
+        within = cross @ to_spots[known].T + ALBEDO_NOISE * np.eye(len(known))
+        albedo = mean + cross.T @ np.linalg.solve(within, energy[known] - mean)
+        np.fill_diagonal(reflectance[laser], np.maximum(albedo, 0.0) / area)
+    return ReflectanceModel(
+        samples.mesh, reflectance, np.zeros_like(reflectance), measured_entries(samples), Boundary(samples.eta),
+        {"method": "lambertian"},
+    )  # fmt: skip

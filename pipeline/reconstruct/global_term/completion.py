@@ -1,0 +1,229 @@
+"""The default method: every entry of the symmetric V x V matrix from the columns at the spots.
+
+R_d(x_i, x_o) = [mean of f(distance) over the patches] * exp(s(distance) G(x_i, x_o)), where f is the radial profile of
+all samples, s the size of what it leaves unexplained, and G a smooth symmetric function on pairs of surface points.
+G solves one symmetric positive definite system: the samples at the spots' barycentric points bind columns and, by
+reciprocity, rows; smoothness over the surface on both sides fills the rest. Values are compared with their expectation
+linearly and weighted by precision (`Measured.residual`), so that a noisy tail neither dominates nor turns negative.
+
+The fit fills what was not measured. An entry next to a spot holds the sample itself, as far as noise lets it speak
+(`hold_measured`): nothing that was measured is overwritten by fill (docs/decisions/0013).
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from pipeline.model.reflectance import ReflectanceModel
+from pipeline.reconstruct.global_term.boundary_fit import measure_boundary
+from pipeline.reconstruct.global_term.harmonics import Harmonics, harmonics
+from pipeline.reconstruct.global_term.radial_profile import Measured, Tilt, fit_profile
+from pipeline.reconstruct.samples.samples import ANGULAR, Samples, SpotSumImage
+from pipeline.reconstruct.samples.spots import outward_tilt
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+
+log = logging.getLogger(__name__)
+
+# Chosen by leaving a fifth of the spots out, without the truth (docs/decisions/0013); lengths in edges of the scan.
+RANGE_EDGES = 2.0  # correlation length of G
+NEAR, FAR, TURN_EDGES = 0.08, 0.6, 3.6  # s(distance): relative deviation of R_d from the profile
+BOTH_ENDS = 2 * ANGULAR**2  # relative variance of any entry that directions leave, in and out
+ROUNDS = 2  # of Gauss-Newton, for each of as many fits of the profile
+TOLERANCE = 1e-2  # of conjugate gradients; every solve starts from the one before
+MOST_STEPS = 300
+MOST_HARMONICS = 500
+
+
+def deviation(edges: F64) -> F64:
+    """s: standard deviation of log R_d about the radial profile, by distance in edges."""
+    return np.asarray(NEAR + (FAR - NEAR) * -np.expm1(-((edges / TURN_EDGES) ** 2)))
+
+
+@dataclass(frozen=True)
+class SymmetricField:
+    """G = U Y U^T on vertices, B G on the spots; Y is symmetric. The prior is Gaussian with mean variance 1.
+
+    vertices: (V, n) U; spots: (S, n) B U; penalty: (n, n) precision of the entries of Y
+    """
+
+    vertices: F32
+    spots: F32
+    penalty: F32
+
+    @classmethod
+    def of(cls, basis: Harmonics, to_spots: sparse.csr_array, range_mm: float) -> SymmetricField:
+        """Matern on both sides: separable, so that G is smooth along rows and columns alike."""
+        rough = basis.roughness(range_mm)
+        penalty = rough[:, None] * rough[None, :]
+        # Y is symmetric: two entries off the diagonal are one unknown, of half the variance.
+        penalty *= 0.5 * ((1.0 / penalty).sum() + (1.0 / np.diag(penalty)).sum())
+        functions = basis.functions.astype(np.float32)
+        return cls(functions, np.asarray(to_spots @ functions, np.float32), penalty.astype(np.float32))
+
+    def at_spots(self, y: F32) -> F32:
+        """(S, V) values of the field between spots and vertices."""
+        return np.asarray((self.spots @ y) @ self.vertices.T)
+
+    def gather(self, entries: F32) -> F32:
+        """Adjoint of `at_spots`, symmetrised."""
+        y = self.spots.T @ (entries @ self.vertices)
+        return np.asarray((y + y.T) / 2)
+
+    def solve(self, target: F64, weight: F64, scale: F64, start: F32) -> F32:
+        """Y that minimises sum weight (target - scale * field)^2 + Y penalty Y, by preconditioned conjugate gradients.
+
+        target, weight, scale: (S, V); weight is 0 where nothing was observed. start: (n, n) first guess.
+        """
+        w = (weight * scale**2).astype(np.float32)
+        right = self.gather((weight * scale * target).astype(np.float32))
+        precondition = 1.0 / (self.penalty + 0.5 * w.sum())
+        y = start
+        residual = right - self.gather(w * self.at_spots(y)) - self.penalty * y
+        z = residual * precondition
+        direction, size = z, float((residual * z).sum())
+        stop = TOLERANCE**2 * float((right * right * precondition).sum())
+        for _ in range(MOST_STEPS):
+            if size <= stop:
+                return y
+            image = self.gather(w * self.at_spots(direction)) + self.penalty * direction
+            length = size / float((direction * image).sum())
+            y = y + length * direction
+            residual = residual - length * image
+            z = residual * precondition
+            before, size = size, float((residual * z).sum())
+            direction = z + size / before * direction
+        log.warning("completion: conjugate gradients stopped after %d steps", MOST_STEPS)
+        return y
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One laser's smooth model.
+
+    entries: (V, V) R_d, symmetric and positive; at_spots: (S, V) the same between beams and vertices; both in mm^-2,
+    means over all directions; tilt: how single directions depart from them; field: (n, n) Y
+    """
+
+    entries: F64
+    at_spots: F64
+    direction_bias: Tilt
+    field: F32
+
+
+def fit_laser(samples: Samples, laser: int, field: SymmetricField, start: F32) -> Fit:
+    """The profile and the field in turn. start: (n, n) first guess of Y, the laser's before."""
+    pairs, vertex_pairs, measured = samples.spot_pairs, samples.vertex_pairs, Measured.of(samples, laser)
+    edge = float(samples.mesh.edges_unique_length.mean())
+    scale, y, profile = deviation(measured.edges), start, None
+    smooth = scale * field.at_spots(y)
+    for _ in range(ROUNDS):
+        profile, direction_bias = fit_profile(pairs, measured, edge, samples.direction_bias, smooth, profile)
+        prior, leaning = pairs.mean(profile), direction_bias(pairs.distance) * samples.direction_bias
+        for _ in range(ROUNDS):
+            relative, weight = measured.residual(prior * np.exp(smooth + leaning))
+            y = field.solve(relative + smooth, weight, scale, y)
+            smooth = scale * field.at_spots(y)
+    profile, direction_bias = fit_profile(pairs, measured, edge, samples.direction_bias, smooth, profile)
+    kernel = vertex_pairs.mean(profile)
+    exponent = deviation(vertex_pairs.distance / edge) * (field.vertices @ y @ field.vertices.T)
+    entries = 0.5 * (kernel + kernel.T) * np.exp(0.5 * (exponent + exponent.T))
+    return Fit(entries, pairs.mean(profile) * np.exp(smooth), direction_bias, y)
+
+
+def hold_measured(samples: Samples, fits: list[Fit], lift: F64, left: F64) -> tuple[F64, F64, NDArray[np.bool_]]:
+    """(L, V, V) R_d in mm^-2 that holds what was measured, its relative variance, and (V, V) the measured entries.
+
+    lift: (V, V) expectation over the fit; left: (V, V) relative variance of the fill, where nothing was measured.
+
+    A sample is the mean over a beam and a hat function in one direction, an entry the mean over two hat functions and
+    all directions. The fit says what lies between: sample / its expectation = entry / its expectation. Spots whose
+    triangle the vertex belongs to are averaged by their share and precision, and by reciprocity from both sides. A
+    measured entry is the mean of that and of the fill, by their precisions: the sample itself unless noise drowns it.
+    """
+    used = np.flatnonzero(samples.spots.transmitted > 0)
+    share = sparse.csr_array(
+        (
+            samples.spots.barycentric[used].ravel(),
+            (samples.mesh.faces[samples.spots.triangle[used]].ravel(), np.repeat(used, 3)),
+        ),
+        shape=(len(samples.mesh.vertices), len(samples.values[0])),
+    )
+    squared, measured_in_all = share.multiply(share).tocsr(), measured_entries(samples)
+    entries, variances = [], []
+    for laser, fit in enumerate(fits):
+        measured = Measured.of(samples, laser)
+        expected = fit.at_spots * np.exp(fit.direction_bias(samples.spot_pairs.distance) * samples.direction_bias)
+        variance = measured.variance(expected)
+        weight = np.where(measured.observed, 1.0 / (variance + ANGULAR**2), 0.0)
+        ratio = share @ (weight * np.where(measured.observed, measured.value / expected, 0.0))
+        total = share @ weight
+        spread = squared @ (weight**2 * variance)
+        for sums in (ratio, total, spread):
+            sums += np.where(np.eye(len(sums), dtype=bool), 0.0, sums.T)  # on the diagonal both sides are one sample
+        ratio = ratio / np.maximum(total, 1e-30)
+        noise = np.where(measured_in_all, spread / np.maximum(total, 1e-30) ** 2, np.inf)
+        trust = left / (left + noise)  # of the sample against the fill
+        entries.append(np.maximum(fit.entries * (trust * np.where(trust > 0, ratio, 0.0) + (1 - trust) * lift), 0.0))
+        variances.append((1 - trust) * left)  # = 1 / (1 / left + 1 / noise)
+    return np.stack(entries), np.stack(variances), measured_in_all
+
+
+def unexplained(samples: Samples, basis: Harmonics, range_mm: float) -> F64:
+    """(V, V) share of the prior variance of G that the samples leave, 0..1, by kriging from either side.
+
+    From the side of u: the share that spots leave at u, where those spots saw v; the better of both sides counts.
+    """
+    covariance = basis.covariance(range_mm)
+    used = samples.spots.transmitted > 0
+    to_spots = samples.lit[np.flatnonzero(used)]
+    cross = to_spots @ covariance  # (S, V)
+    noise = (ANGULAR / FAR) ** 2  # far from the spots; near them next to nothing is left open in any case
+    gain = np.linalg.solve(cross @ to_spots.T + noise * np.eye(len(cross)), cross)
+    explained = (cross * gain).sum(axis=0) / np.diag(covariance)
+    share = np.abs(gain) / np.maximum(np.abs(gain).sum(axis=0), 1e-12)
+    seen = share.T @ np.isfinite(samples.values[:, used]).all(axis=0).astype(np.float64)
+    left = 1.0 - explained[:, None] * seen
+    return np.asarray(np.clip(np.minimum(left, left.T), 0.0, 1.0))
+
+
+def measured_entries(samples: Samples) -> NDArray[np.bool_]:
+    """(V, V) entries next to a sample: a spot lies in a triangle at one vertex and the other vertex was observed."""
+    out = np.zeros((len(samples.mesh.vertices),) * 2, bool)
+    for spot in np.flatnonzero(samples.spots.transmitted > 0):
+        out[samples.mesh.faces[samples.spots.triangle[spot]]] |= np.isfinite(samples.values[:, spot]).all(axis=0)
+    return out | out.T
+
+
+def complete(samples: Samples) -> ReflectanceModel:
+    """The default method: samples -> model."""
+    edge = float(samples.mesh.edges_unique_length.mean())
+    basis = harmonics(samples.mesh, MOST_HARMONICS)
+    field = SymmetricField.of(basis, samples.lit, RANGE_EDGES * edge)
+    fits: list[Fit] = []
+    for laser in range(len(samples.values)):
+        fits.append(fit_laser(samples, laser, field, fits[-1].field if fits else np.zeros_like(field.penalty)))
+    edges = samples.vertex_pairs.distance / edge
+    left = deviation(edges) ** 2 * unexplained(samples, basis, RANGE_EDGES * edge)
+    # What is left open about log R_d raises the expectation of R_d: the mean of a log-normal.
+    reflectance, relative, measured = hold_measured(samples, fits, np.exp(0.5 * left), left + BOTH_ENDS)
+
+    def expected(glow: SpotSumImage) -> F64:
+        direction_bias = sum(outward_tilt(samples.mesh, samples.spots, glow.camera.position))
+        distance = samples.spot_pairs.distance
+        return np.stack([fit.at_spots * np.exp(fit.direction_bias(distance) * direction_bias) for fit in fits])
+
+    return ReflectanceModel(
+        samples.mesh,
+        reflectance.astype(np.float32),
+        (reflectance**2 * (relative + BOTH_ENDS)).astype(np.float32),
+        measured,
+        measure_boundary(samples.mesh, samples.eta, samples.glow, expected),
+        {"method": "default"},
+    )

@@ -1,0 +1,189 @@
+"""R_d as a function of distance alone, fitted to the samples: the prior of the completion.
+
+log f(r) is a cubic spline, so f is positive and smooth over many decades. The samples are never put into a logarithm:
+noise makes the faint ones zero or negative. Instead the expectation mu = mean of f over beam and hat function is
+fitted to the values by Gauss-Newton with the variance of the model's own mean (a quasi-likelihood with log link,
+McCullagh & Nelder 1989, ch. 9), which averages noise linearly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+from pipeline.reconstruct.samples.distances import Pairs
+from pipeline.reconstruct.samples.samples import ANGULAR, Samples
+
+F64 = NDArray[np.float64]
+
+FAR_SCATTER = 0.3  # how the relative scatter of R_d about a smooth model grows with log(1 + edges / SCATTER_EDGES)
+SCATTER_EDGES = 3.0
+OUTLIER = 3.0  # standard deviations from which on a value counts less (Huber)
+LARGEST_STEP = 2.0  # relative: what lies further from its expectation is taken to lie here
+ITERATIONS = 12
+TILT_EDGES = (0.5, 2.0, 4.5, 10.0)
+ENOUGH = 3e-3  # change of log f at which the fit ends
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One laser's samples, (S, V) each.
+
+    value: mm^-2, 0 where unobserved; observed; dark: variance without signal, mm^-4; noise: variance per signal, mm^-2;
+    oblique: relative variance from obliqueness; edges: distance from spot to vertex in edges of the scan
+    """
+
+    value: F64
+    observed: NDArray[np.bool_]
+    dark: F64
+    noise: F64
+    oblique: F64
+    edges: F64
+
+    @classmethod
+    def of(cls, samples: Samples, laser: int) -> Measured:
+        """One laser's part of the samples."""
+        observed = np.isfinite(samples.values[laser])
+        value, dark, noise = (
+            np.where(observed, a[laser], 0.0).astype(np.float64)
+            for a in (samples.values, samples.dark_variance, samples.noise_per_signal)
+        )
+        edges = samples.spot_pairs.distance / float(samples.mesh.edges_unique_length.mean())
+        return cls(value, observed, dark, noise, samples.oblique.astype(np.float64), edges)
+
+    def variance(self, expected: F64) -> F64:
+        """Relative variance of a sample of this expectation by noise and obliqueness."""
+        return np.asarray((self.dark + self.noise * expected) / expected**2 + self.oblique)
+
+    def residual(self, expected: F64) -> tuple[F64, F64]:
+        """Relative residual value / expected - 1 and its weight (0 where unobserved), outliers bounded.
+
+        The bounds are symmetric in units of the noise: noise that drowns a signal must not raise it.
+        """
+        relative = np.where(self.observed, self.value / expected - 1.0, 0.0)
+        deviation = np.sqrt(self.variance(expected) + scatter(self.edges) ** 2)
+        weight = np.where(self.observed, 1.0 / deviation**2, 0.0)
+        bound = np.maximum(LARGEST_STEP, OUTLIER * deviation)
+        return np.clip(relative, -bound, bound), weight / np.maximum(np.abs(relative) / (OUTLIER * deviation), 1.0)
+
+
+def scatter(edges: F64) -> F64:
+    """Relative scatter of R_d about a smooth model, by distance in edges: direction, position, shape, detail."""
+    return np.asarray(ANGULAR + FAR_SCATTER * np.log1p(edges / SCATTER_EDGES))
+
+
+@dataclass(frozen=True)
+class Profile:
+    """log f(r) = sum of coefficients times cubic B-splines of r in mm; beyond the last knot it is constant."""
+
+    knots: F64
+    coefficients: F64
+
+    def basis(self, distance: F64) -> F64:
+        """(..., n) values of the B-splines."""
+        inside = np.clip(np.asarray(distance, np.float64), self.knots[0], np.nextafter(self.knots[-1], 0))
+        matrix = BSpline.design_matrix(inside.ravel(), self.knots, 3).toarray()
+        return np.asarray(matrix.reshape(*np.shape(distance), -1))
+
+    def __call__(self, distance: F64) -> F64:
+        """f in mm^-2."""
+        inside = np.clip(np.asarray(distance, np.float64), self.knots[0], np.nextafter(self.knots[-1], 0))
+        return np.asarray(np.exp(BSpline(self.knots, self.coefficients, 3)(inside)))
+
+
+def _knots(edge: float, largest: float) -> F64:
+    """Knots in mm: as dense as the mesh resolves near zero, then in geometric steps."""
+    inner = edge * np.array([0.25, 0.55, 0.9, 1.5, 2.2])
+    outer = np.geomspace(3.0 * edge, max(largest, 4.5 * edge), 8)
+    return np.concatenate([np.zeros(4), inner, outer[:-1], np.repeat(outer[-1], 4)])
+
+
+def _start(profile: Profile, measured: Measured, distance: F64) -> F64:
+    """Coefficients through the logarithms of means over bins of distance."""
+    edges = np.quantile(distance[measured.observed], np.linspace(0, 1, 41))
+    bin_of = np.clip(np.searchsorted(edges, distance) - 1, 0, 39)
+    at, level = [], []
+    for b in range(40):
+        chosen = measured.observed & (bin_of == b)
+        if chosen.any() and measured.value[chosen].mean() > 0:
+            at.append(distance[chosen].mean())
+            level.append(np.log(measured.value[chosen].mean()))
+    basis = profile.basis(np.array(at))
+    bend = np.diff(np.eye(basis.shape[1]), 2, axis=0)
+    return np.asarray(np.linalg.solve(basis.T @ basis + 1e-2 * bend.T @ bend, basis.T @ np.array(level)))
+
+
+@dataclass(frozen=True)
+class Tilt:
+    """log R_d seen in a direction is that over all directions + slope(distance) * `outward_tilt`.
+
+    Light that has not lost its direction leaves ahead: more is seen along its way than against it, and on a convex
+    object cameras look against it. `slopes` are at TILT_EDGES edges of length `edge` (mm), linear in log distance.
+    """
+
+    edge: float
+    slopes: F64
+
+    @staticmethod
+    def basis(distance: F64, edge: float) -> F64:
+        """(..., 4) hat functions of log distance."""
+        knots = np.log(edge * np.array(TILT_EDGES))
+        at = np.log(np.maximum(distance, 0.1 * edge))
+        return np.stack([np.interp(at, knots, one) for one in np.eye(len(knots))], axis=-1)
+
+    def __call__(self, distance: F64) -> F64:
+        """The slope at distances in mm."""
+        return np.asarray(self.basis(distance, self.edge) @ self.slopes)
+
+
+def fit_profile(
+    pairs: Pairs,
+    measured: Measured,
+    edge: float,
+    direction_bias: F64,
+    offset: F64 | float = 0.0,
+    start: Profile | None = None,
+) -> tuple[Profile, Tilt]:
+    """Fit f and the tilt's slopes so that exp(offset + slope * tilt) * (mean of f over the patches) meets the values.
+
+    tilt: (S, V) of the samples; offset: (S, V) or 0; start: a first guess. f is the mean over all directions.
+    """
+    knots = _knots(edge, float(pairs.distance.max()) * 1.01)
+    profile = start or Profile(knots, _start(Profile(knots, np.zeros(len(knots) - 4)), measured, pairs.distance))
+    near_basis, basis = profile.basis(pairs.centres), profile.basis(pairs.distance)
+    n = basis.shape[2]
+    leaning = Tilt.basis(pairs.distance, edge) * direction_bias[:, :, None]
+    slopes = np.zeros(leaning.shape[2])
+    bend = np.diff(np.eye(n), 2, axis=0)
+    stiff = np.eye(n + len(slopes))
+    stiff[:n, :n] = bend.T @ bend
+    for _ in range(ITERATIONS):
+        expected = pairs.mean(profile)
+        jacobian = basis.copy()
+        slope = pairs.histogram @ (profile(pairs.centres)[:, None] * near_basis)
+        jacobian[pairs.first, pairs.second] = slope / expected[pairs.first, pairs.second][:, None]
+        relative, weight = measured.residual(expected * np.exp(offset + leaning @ slopes))
+        flat, w = np.concatenate([jacobian, leaning], axis=2).reshape(-1, len(stiff)), weight.ravel()
+        now = np.concatenate([profile.coefficients, slopes])
+        step = np.linalg.solve((flat * w[:, None]).T @ flat + stiff, flat.T @ (w * relative.ravel()) - stiff @ now)
+        step *= min(1.0, 2.0 / np.abs(step).max())
+        profile, slopes = Profile(knots, now[:n] + step[:n]), now[n:] + step[n:]
+        if np.abs(step).max() < ENOUGH:
+            break
+    return profile, Tilt(edge, slopes)
+
+
+def over_directions(samples: Samples, laser: int) -> tuple[Measured, Profile]:
+    """One laser's samples with the direction's factor taken out, and the profile: what the simple models are fitted to.
+
+    They know nothing of directions; a mean over those that the cameras happened to look from would be too low.
+    """
+    measured = Measured.of(samples, laser)
+    edge = float(samples.mesh.edges_unique_length.mean())
+    profile, direction_bias = fit_profile(samples.spot_pairs, measured, edge, samples.direction_bias)
+    return replace(
+        measured, value=measured.value * np.exp(-direction_bias(samples.spot_pairs.distance) * samples.direction_bias)
+    ), profile

@@ -1,0 +1,274 @@
+"""From raw records to readings at the vertices, as fast as records are decoded.
+
+What is constant per view is computed once, and images of one view and laser are then read together (thesis 5.1): a
+record becomes radiance by one look-up per pixel, and the readings contain the lens's vignetting. Every vertex is read
+from every image; noise is not: it is summed over the images, since only its mean over the spots is wanted.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy import sparse
+
+from hw.base.errors import DiscoError
+from hw.base.resources import usable_cores
+from hw.record import RawImage, Sensor, to_radiance
+from pipeline.calibrate.calibration import Calibration
+from pipeline.geometry.pixel_footprints import window
+from pipeline.plan.plan import ImageAddress
+from pipeline.reconstruct.samples.image_operators import ImageOperator
+from pipeline.stream.stream import CorruptImage, StreamReader
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+
+log = logging.getLogger(__name__)
+
+MIN_SHARE = 0.5  # of a vertex's hat that a camera must see
+TOGETHER = 32  # images whose sums one thread keeps in single precision
+# (1, -2, 1) x (1, -2, 1) answers white noise of variance s^2 with 36 s^2, and a slope not at all (Immerkaer 1996).
+SECOND_DIFFERENCES = 36.0
+
+
+@dataclass(frozen=True)
+class ViewReader:
+    """What the images of one view have in common.
+
+    window: (rows, columns) of the image that show the object
+    rows: per way of reading, (n,) the vertices that are seen well enough
+    operators: per way, (n, h * w) float32, radiance in the window without the lens's gain -> their readings
+    gain: (h, w) by which the lens makes the radiance appear too low
+    """
+
+    view: int
+    window: tuple[slice, slice]
+    rows: Mapping[str, NDArray[np.int64]]
+    operators: Mapping[str, sparse.csr_array]
+    gain: F64
+
+    @classmethod
+    def of(
+        cls, view: int, calibration: Calibration, mesh: trimesh.Trimesh, readings: Mapping[str, ImageOperator]
+    ) -> ViewReader:
+        """The sight of a view by all ways of reading it."""
+        camera = calibration.view_camera(view)
+        part = window(mesh, camera)
+        gain = 1.0 / calibration.vignetting(view)[part]
+        inside = np.arange(camera.height * camera.width).reshape(camera.height, camera.width)[part].ravel()
+        lens = sparse.diags_array(gain.ravel())
+        rows = {way: np.flatnonzero(reading.share > MIN_SHARE) for way, reading in readings.items()}
+        operators = {way: _single(reading.operator[rows[way]][:, inside] @ lens) for way, reading in readings.items()}
+        return cls(view, part, rows, operators, gain)
+
+
+@dataclass
+class Sums:
+    """Sums over images of one view and laser, (h, w) of the window. An image's radiance L counts as scale * L.
+
+    glow: of radiance; noise: of each pixel's noise variance as its 3 x 3 neighbours show it, exact on average;
+    shot: of the variance that the camera's model gives
+    """
+
+    glow: F64
+    noise: F64
+    shot: F64
+
+    @classmethod
+    def zeros(cls, shape: tuple[int, int], dtype: type[np.floating] = np.float64) -> Sums:
+        """No image yet."""
+        return cls(*(np.zeros(shape, dtype) for _ in range(3)))
+
+    def add(self, radiance: NDArray[np.floating], variance: NDArray[np.floating]) -> None:
+        """One image, scaled; both contiguous.
+
+        Differences are taken along the flat image, in few passes. At the ends of its rows they are not of neighbours,
+        and `noise_variance` does not use them.
+        """
+        self.glow += radiance
+        self.shot += variance
+        flat, width = radiance.reshape(-1), radiance.shape[1]
+        middle = flat[width:-width]
+        curved = flat[: -2 * width] + flat[2 * width :]
+        curved -= middle
+        curved -= middle
+        middle = curved[1:-1]
+        twice = curved[:-2] + curved[2:]
+        twice -= middle
+        twice -= middle
+        twice *= twice
+        self.noise.reshape(-1)[width + 1 : -width - 1] += twice
+
+    def __iadd__(self, other: Sums) -> Sums:
+        self.glow += other.glow
+        self.noise += other.noise
+        self.shot += other.shot
+        return self
+
+    def noise_variance(self) -> F64:
+        """(h, w) the sum of noise variances. Pixels at the window's border have no neighbours: they take the next's."""
+        inner = self.noise[1:-1, 1:-1] / SECOND_DIFFERENCES
+        return np.pad(inner, 1, mode="edge") if inner.size else np.zeros_like(self.noise)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Images of one view and laser."""
+
+    sight: ViewReader
+    laser: int
+    addresses: Sequence[ImageAddress]
+
+
+@dataclass
+class BatchResult:
+    """What came of a task.
+
+    value: per way, (n, rows) readings in mm^-2; NaN where an image is lost, saturated or hidden by a highlight
+    alone: per way, (2, rows) noise and shot variance in mm^-4 of images of which some readings are NaN; the sums of
+        noise and shot are without them
+    scale: (n,) pi / (F_t(w_i) Phi) of each image, times the camera's factor to the photodiode; 0 where it is lost
+    saturated: pixels; hidden: readings that a highlight alone has cost
+    """
+
+    task: Batch
+    value: dict[str, F32]
+    alone: dict[str, F64]
+    scale: F64
+    sums: Sums
+    lost: list[ImageAddress] = field(default_factory=list)
+    saturated: int = 0
+    hidden: int = 0
+
+    @classmethod
+    def of(cls, task: Batch) -> BatchResult:
+        """Nothing read yet."""
+        count = len(task.addresses)
+        rows = {way: len(vertices) for way, vertices in task.sight.rows.items()}
+        return cls(
+            task,
+            {way: np.full((count, n), np.nan, np.float32) for way, n in rows.items()},
+            {way: np.zeros((2, n)) for way, n in rows.items()},
+            np.zeros(count),
+            Sums.zeros(task.sight.gain.shape, np.float32),
+        )
+
+
+def _single(matrix: Any) -> sparse.csr_array:
+    """The matrix in single precision and with short indices: what is read once per image should be small."""
+    m = sparse.csr_array(matrix)
+    short = m.indices.astype(np.int32), m.indptr.astype(np.int32)
+    return sparse.csr_array((m.data.astype(np.float32), *short), shape=m.shape)
+
+
+def look_up(sensor: Sensor, laser: int) -> tuple[F32, F32]:
+    """Radiance and variance, each (steps * 2^bits,), of every record that a pixel may hold."""
+    shape = (sensor.steps, 1 << sensor.bits)
+    exponent, charge = np.indices(shape, np.uint16)
+    image = to_radiance(RawImage(exponent.astype(np.uint8), charge), sensor, laser)
+    return image.radiance.ravel(), image.variance.ravel()
+
+
+def resample(
+    stream: StreamReader,
+    calibration: Calibration,
+    sights: Sequence[ViewReader],
+    transmitted: F64,
+    hidden: Mapping[tuple[int, int], NDArray[np.int64]],
+) -> Iterator[BatchResult]:
+    """Every spot image once, by all cores, in parts whose order is always the same.
+
+    transmitted: (S,) F_t(w_i) of the spots; images of spots where it is 0 are not read
+    hidden: (view, spot) -> vertices that are not read, if any
+    """
+    plan, tables = stream.plan, [look_up(calibration.sensor, laser) for laser in range(stream.plan.lasers)]
+    tasks = []
+    for sight in sights:
+        spots = [s for s in plan.spots_at(plan.angle_of(sight.view)) if transmitted[s] > 0]
+        for laser in range(plan.lasers):
+            for low in range(0, len(spots), TOGETHER):
+                some = [ImageAddress(sight.view, "spot", s, laser) for s in spots[low : low + TOGETHER]]
+                tasks.append(Batch(sight, laser, some))
+
+    def work(task: Batch) -> BatchResult:
+        part, view = BatchResult.of(task), task.sight.view
+        for i, address in enumerate(task.addresses):
+            raw = _record(stream, address, calibration.sensor)
+            if raw is None:
+                part.lost.append(address)
+                continue
+            power = stream.meta(address).photodiode_w
+            part.scale[i] = np.pi * calibration.factor(view, task.laser) / (transmitted[address.spot] * power)
+            _read(part, i, raw, calibration.sensor, tables[task.laser], hidden.get((task.sight.view, address.spot)))
+        return part
+
+    with ThreadPoolExecutor(usable_cores(), thread_name_prefix="resample") as pool:
+        yield from pool.map(work, tasks)
+
+
+def _read(
+    part: BatchResult, i: int, raw: RawImage, sensor: Sensor, table: tuple[F32, F32], hidden: NDArray[np.int64] | None
+) -> None:
+    """Image number i of a part: every step before the next image, while it is in the cache."""
+    sight, scale = part.task.sight, part.scale[i]
+    index = raw.exponent[sight.window].astype(np.min_scalar_type(len(table[0]) - 1))
+    index <<= index.dtype.type(sensor.bits)
+    index |= raw.charge[sight.window]
+    place = index.astype(np.intp)
+    # Scaling the tables is less work than scaling the images; all places are in range, as `_record` has seen to.
+    radiance = (table[0] * np.float32(scale)).take(place, mode="clip")
+    variance = (table[1] * np.float32(scale**2)).take(place, mode="clip")
+    for way, operator in sight.operators.items():
+        part.value[way][i] = operator @ radiance.reshape(-1)
+    full = None
+    if raw.charge.max() >= sensor.saturation_dn:
+        part.saturated += int((raw.charge >= sensor.saturation_dn).sum())
+        full = (raw.charge[sight.window] >= sensor.saturation_dn).reshape(-1).astype(np.float32)
+    if hidden is None and full is None:
+        part.sums.add(radiance, variance)
+    else:
+        own = Sums.zeros(sight.gain.shape)
+        own.add(radiance, variance)
+        part.sums.glow += radiance
+        for way in sight.operators:
+            _read_in_part(part, i, way, own, full, hidden)
+
+
+def _read_in_part(
+    part: BatchResult, i: int, way: str, own: Sums, full: F32 | None, hidden: NDArray[np.int64] | None
+) -> None:
+    """Blank what an image cannot tell; its noise is read for the rest alone, since sums forget for which vertices."""
+    sight = part.task.sight
+    operator, rows = sight.operators[way], sight.rows[way]
+    touched = np.zeros(len(rows), bool) if full is None else abs(operator) @ full > 0
+    masked = np.isin(rows, [] if hidden is None else hidden) & ~touched
+    read = np.flatnonzero(~touched & ~masked)
+    squared = operator[read].multiply(operator[read])
+    part.alone[way][:, read] += squared @ own.noise_variance().ravel(), squared @ own.shot.ravel()
+    part.value[way][i, touched | masked] = np.nan
+    part.hidden += int(masked.sum())
+
+
+def _record(stream: StreamReader, address: ImageAddress, sensor: Sensor) -> RawImage | None:
+    """The record, or None with a warning where it is damaged or was taken without light."""
+    try:
+        raw = stream.read(address)
+    except CorruptImage as corrupt:
+        log.warning("%s", corrupt)
+        return None
+    if not stream.meta(address).photodiode_w > 0:
+        log.warning("%s: the photodiode saw no light; image left out", address)
+        return None
+    if raw.exponent.max() >= sensor.steps or raw.charge.max() > sensor.saturation_dn:
+        raise DiscoError(
+            f"{address}: exponent {raw.exponent.max()}, charge {raw.charge.max()} do not fit the sensor "
+            f"({sensor.steps} steps, {sensor.bits} bits). Remedy: use the sensor.json of this capture"
+        )
+    return raw

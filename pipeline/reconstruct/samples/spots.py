@@ -1,0 +1,68 @@
+"""Where the laser spots lie on the scan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from pipeline.calibrate.calibration import Calibration
+from pipeline.geometry.fresnel import transmittance
+from pipeline.geometry.mesh import first_hit, interpolated_normals
+from pipeline.plan.plan import Plan
+from pipeline.reconstruct.settings import ReconstructConfig
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Spots:
+    """Where the beam's axis meets the scan. All of length S, object frame, mm.
+
+    transmitted: F_t(w_i), 0 for spots that are not used (the beam misses the scan or meets it too obliquely)
+    """
+
+    position: F64  # (S, 3)
+    direction: F64  # (S, 3) unit, of travel
+    normal: F64  # (S, 3) unit
+    triangle: I64  # (S,)
+    barycentric: F64  # (S, 3)
+    transmitted: F64  # (S,)
+    beam_radius: float
+
+
+def locate_spots(mesh: trimesh.Trimesh, calibration: Calibration, plan: Plan, settings: ReconstructConfig) -> Spots:
+    """Meet the calibrated beam axes with the scan."""
+    origins, direction = calibration.spot_rays(plan.spots)
+    hit = first_hit(mesh, origins, direction)
+    triangle = np.maximum(hit.triangle, 0)
+    barycentric = np.where(hit.triangle[:, None] >= 0, hit.barycentric, 1.0 / 3.0)
+    normal = interpolated_normals(mesh, triangle, barycentric)
+    cosine = -(normal * direction).sum(axis=1)
+    used = (hit.triangle >= 0) & (cosine > np.cos(np.deg2rad(settings.max_incidence_deg)))
+    position = (mesh.triangles[triangle] * barycentric[:, :, None]).sum(axis=1)
+    transmitted = np.where(used, transmittance(cosine, settings.eta), 0.0)
+    radius = calibration.projectors[0].beam_diameter_mm / 2
+    return Spots(position, direction, normal, triangle, barycentric, transmitted, radius)
+
+
+def outward_tilt(mesh: trimesh.Trimesh, spots: Spots, eye: F64) -> tuple[F64, F64]:
+    """How much one looks along the light's way: (S, V) at the vertices for a camera at `eye`, (S, V) at the spots.
+
+    At a vertex: component of the direction to the camera along the tangent that points away from the spot. At a spot,
+    the same with the roles exchanged: component of the direction to the laser along the tangent away from the vertex.
+    """
+    points, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
+    way = points[None] - spots.position[:, None]
+
+    def along(tangent_of: F64, normal: F64, towards: F64) -> F64:
+        tangent = tangent_of - (tangent_of * normal).sum(axis=2, keepdims=True) * normal
+        length = np.maximum(np.linalg.norm(tangent, axis=2), 1e-9)
+        return np.asarray((tangent * towards).sum(axis=2) / length)
+
+    to_eye = eye - points
+    to_eye /= np.linalg.norm(to_eye, axis=1, keepdims=True)
+    return along(way, normals[None], to_eye[None]), along(-way, spots.normal[:, None], -spots.direction[:, None])

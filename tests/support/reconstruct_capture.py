@@ -1,0 +1,96 @@
+"""A capture of a sphere with a known R_d, written without a renderer: radiance straight from eq. 2.1."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from hw.record import RawImage, Sensor
+from pipeline.calibrate.calibration import Calibration, nominal_calibration
+from pipeline.geometry.fresnel import transmittance
+from pipeline.geometry.mesh import first_hit
+from pipeline.geometry.nominal_rig import CameraConfig, LaserConfig, ProjectorConfig, RigConfig, SensorConfig
+from pipeline.plan.plan import ImageAddress, Plan, make_plan
+from pipeline.records import RigFile, SensorFile
+from pipeline.stream.stream import ImageMeta, StreamWriter
+
+RADIUS = 15.0
+ETA = 1.3
+SENSOR = Sensor(1 / 30, 12, 12, 24.8, 25.0, 500.0, 64.0, (2e14, 2e14), 43_750.0)
+POWER = (0.01, 0.008)
+
+
+def reflectance(distance: np.ndarray, laser: int) -> np.ndarray:
+    """R_d in mm^-2: wide enough that averaging over hats and beam changes it little."""
+    return np.asarray((0.004 - 0.001 * laser) * np.exp(-distance / 6.0))
+
+
+def rig() -> RigConfig:
+    """Two cameras, two turntable angles, two lasers."""
+    common = {"width": 96, "height": 80, "focal_length_mm": 20.0, "pixel_pitch_um": 20.0}
+    front = CameraConfig(name="front", position_mm=(380.0, -140.0, 120.0), **common)
+    back = CameraConfig(name="back", position_mm=(-350.0, 160.0, -100.0), **common)
+    return RigConfig(
+        lasers=(LaserConfig(wavelength_nm=635), LaserConfig(wavelength_nm=532, power_mw=8.0)),
+        projector=ProjectorConfig(full_angle_deg=5.0),
+        cameras=(front, back),
+        sensor=SensorConfig(),
+        turntable_angles_deg=(0.0, 150.0),
+        spots=24,
+    )
+
+
+def expose(radiance: np.ndarray, laser: int) -> RawImage:
+    """A noiseless sensor that digitises finely: the longest exposure that does not saturate."""
+    rate = radiance * SENSOR.responsivity[laser] + SENSOR.dark_e_per_s
+    full = 0.9 * SENSOR.saturation_dn * SENSOR.gain_e_per_dn
+    need = np.ceil(np.log2(np.maximum(rate * SENSOR.longest_exposure_s / full, 1e-9)))
+    exponent = np.clip(need, 0, SENSOR.steps - 1).astype(np.uint8)
+    electrons = rate * SENSOR.longest_exposure_s * 2.0 ** -exponent.astype(float)
+    charge = np.clip(np.rint(electrons / SENSOR.gain_e_per_dn + SENSOR.offset_dn), 0, SENSOR.saturation_dn)
+    return RawImage(exponent, charge.astype(np.uint16))
+
+
+def images(calibration: Calibration, plan: Plan, address: ImageAddress) -> np.ndarray:
+    """(H, W) radiance of the smooth sphere at pixel centres, before the lens."""
+    camera = calibration.view_camera(address.view)
+    origins, directions = camera.rays(camera.pixel_centres())
+    b = (origins * directions).sum(axis=1)
+    root = b**2 - (origins**2).sum(axis=1) + RADIUS**2
+    hit = root > 0
+    points = origins + directions * (-b - np.sqrt(np.maximum(root, 0)))[:, None]
+    normal = points / RADIUS
+    if address.kind == "silhouette":
+        return np.where(hit, 1e-6, 0.0).reshape(camera.height, camera.width)
+    o, d = (x[0] for x in calibration.spot_rays([plan.spots[address.spot]]))
+    at = o + d * (-(o @ d) - np.sqrt((o @ d) ** 2 - o @ o + RADIUS**2))
+    entering = transmittance(-(at / RADIUS) @ d, ETA) * POWER[address.laser]
+    leaving = transmittance(-(normal * directions).sum(axis=1), ETA)
+    r = reflectance(np.linalg.norm(points - at, axis=1), address.laser)
+    out = np.where(hit, leaving / np.pi * r * entering, 0.0)
+    return np.asarray(out.reshape(camera.height, camera.width))
+
+
+def write_capture(folder: Path, subdivisions: int = 2) -> trimesh.Trimesh:
+    """Everything that the pipeline reads; returns the scan."""
+    folder.mkdir(parents=True)
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS)
+    config = rig()
+    calibration = nominal_calibration(config, SENSOR)
+    plan = make_plan(config, mesh)
+    with StreamWriter(folder, plan) as stream:
+        for n, address in enumerate(plan.addresses()):
+            aim = plan.spots[address.spot] if address.spot >= 0 else None
+            lens = calibration.vignetting(address.view)
+            raw = expose(images(calibration, plan, address) * lens, max(address.laser, 0))
+            power = POWER[address.laser] if aim else 0.0
+            angle = plan.angles_rad[plan.angle_of(address.view)]
+            meta = ImageMeta(n / 15, power, angle, aim.u if aim else -1, aim.v if aim else -1)
+            stream.append(address, raw, meta)
+    mesh.export(folder / "scan.ply")
+    (folder / "rig.json").write_text(RigFile(format_version=1, rig=config).model_dump_json())
+    (folder / "sensor.json").write_text(SensorFile(format_version=1, sensor=SENSOR).model_dump_json())
+    assert (first_hit(mesh, *calibration.spot_rays(plan.spots)).triangle >= 0).all()
+    return mesh

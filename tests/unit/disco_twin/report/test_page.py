@@ -1,0 +1,134 @@
+"""The report is one self-contained page that shows everything it was given."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from report_fakes import LIGHTS, fake_data
+
+from disco_twin.report.calibration import section
+from disco_twin.report.page import ReportData, render, rms, write_report
+
+
+def test_the_page_is_self_contained_and_complete(tmp_path: Path) -> None:
+    write_report(fake_data(), tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert not re.findall(r"(?:src|href)=['\"](?!data:)|https?://|url\(|<script", page)
+    for light in LIGHTS:
+        assert f"<h3>{light}</h3>" in page
+    for heading in (
+        "Impulse responses",
+        "Relit images",
+        "Errors",
+        "Diffuse subsurface",
+        "Calibration",
+        "Time, memory",
+        "left out",
+    ):
+        assert heading in page
+    assert page.count("<img") == len(LIGHTS) + 7
+    assert "pose search" in page
+    assert "quick &lt;&amp;&gt;" in page
+    assert "<deviation>" not in page
+    assert len(page) < 12e6
+
+
+def test_a_run_with_little_to_show_still_gets_its_page() -> None:
+    data = fake_data()
+    summary = {**data.summary, "relit": [], "left_out": []}
+    summary["reflectance"] = {"log10_rmse_by_decade": {}, "coverage_by_decade": {}}
+    page = render(ReportData(summary=summary, wavelengths_nm=(635.0,), main="default"))
+    assert "Nothing: this scene needs every step" in page
+
+
+def test_rms_keeps_the_sign_of_the_square() -> None:
+    assert rms([3.0, 4.0]) == pytest.approx(np.sqrt(12.5))
+    assert rms([-0.1]) == pytest.approx(-0.1)
+    assert rms([0.1, -0.1]) == pytest.approx(0.0)
+
+
+MEASURED = {
+    "source": "measured",
+    "lenses": [
+        {
+            "camera": "front",
+            "boards": 25,
+            "reprojection_px": 0.044,
+            "focal_px": 1405.4,
+            "focal_error_px": 2.7,
+            "centre_px": [96.6, 61.5],
+            "centre_error_px": [1.2, 1.4],
+            "k1": -0.076,
+            "k1_error": 0.031,
+        }
+    ],
+    "response": {"exposure_at_half_range": 0.24, "error_share": 0.0017, "chi2": 1.0},
+    "photometric": {
+        "white_balance": {"front": [0.9915]},
+        "white_balance_error": {"front": [0.0031]},
+        "power_w": [0.00893],
+        "power_drift": [0.35],
+        "power_scatter": [0.0088],
+    },
+    "silhouettes": {
+        "residual_px": 0.037,
+        "edges": 2380,
+        "scan_error_mm": 0.0645,
+        "scan_error_alike_mm": 10.0,
+        "xor_px": [16, 30],
+        "ambiguity": ["rotation about <z>"],
+    },
+    "poses": [{"camera": "front", "rotation_error_deg": 0.087, "across_error_mm": 0.43, "depth_error_mm": 0.86}],
+    "axis": {
+        "tilt_deg": [-0.011, 0.013],
+        "tilt_error_deg": [0.015, 0.012],
+        "offset_mm": [-0.08, -0.04],
+        "offset_error_mm": [0.001, 0.001],
+    },
+    "projector": {
+        "images": 180,
+        "hidden": 91,
+        "false": 3,
+        "used": 86,
+        "residual_mm": 0.039,
+        "spot_error_mm": 0.033,
+        "distance_error_mm": 1.47,
+        "direction_error_deg": 0.085,
+        "full_angle_deg": [5.9854, 6.0066],
+        "full_angle_error_deg": [0.014, 0.0145],
+        "peak_shift_mm": {"per_sine": 0.089, "per_cubed_sine": 0.102},
+        "peak_shift_error_mm": {"per_sine": 0.033, "per_cubed_sine": 0.036},
+    },
+}
+
+
+def test_the_calibration_is_told_with_its_uncertainty() -> None:
+    """Of a measured one every part; of another one why there is nothing to tell. One angle has no axis."""
+    text, body = section(MEASURED, [635.0])
+    assert "standard deviation" in text
+    for shown in (
+        "1405.4 +- 2.7 px (0.19%)",
+        "0.9915 +- 0.0031",
+        "known to 0.17%",
+        "drifted by 35%",
+        "+- 0.43 mm across, +- 0.86 mm along the axis, +- 0.087 deg",
+        "tilt -0.011 +- 0.015, 0.013 +- 0.012 deg",
+        "0.065 mm, alike over 10 mm",
+        "rotation about &lt;z&gt;",
+        "86 used, 91 hidden, 3 false",
+        "+- 0.033 mm",
+        "0.089 +- 0.033 mm sin(t) + 0.102 +- 0.036 mm sin(t)^3",
+    ):
+        assert shown in body
+    assert "axis</td><td class='text'>tilt" not in section(MEASURED | {"axis": None}, [635.0])[1]
+    untold = MEASURED | {"silhouettes": MEASURED["silhouettes"] | {"scan_error_mm": 0.0, "scan_error_alike_mm": 0.0}}
+    assert "own error</td><td class='text'>not known" in section(untold, [635.0])[1]
+    earlier = {
+        k: v for k, v in MEASURED["silhouettes"].items() if k != "scan_error_alike_mm"
+    }  # a run made before it was
+    assert "own error</td><td class='text'>not known" in section(MEASURED | {"silhouettes": earlier}, [635.0])[1]
+    assert section({"source": "nominal"}, [635.0])[1] == ""
+    assert "given as a file" in section({"source": "given"}, [635.0])[0]

@@ -1,0 +1,80 @@
+"""`disco-twin plan`: what its minutes scale with, and what they count."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from disco_twin.experiment.experiment import Experiment
+from disco_twin.run.cost_prediction import predict, simulation_seconds
+from disco_twin.run.simulate import shipped_references
+from disco_twin.scene.scene import load_scene
+
+SCENE = Path(__file__).parents[4] / "scenes" / "quick.toml"
+
+
+@pytest.fixture(scope="module")
+def world() -> Experiment:
+    return Experiment(load_scene(SCENE))
+
+
+def changed(world: Experiment, **simulation: Any) -> Experiment:
+    """The same scene and object with other walks."""
+    work = world.scene.simulation.model_copy(update=simulation)
+    other = Experiment(world.scene.model_copy(update={"simulation": work}))
+    vars(other).update(object=world.object, scan=world.scan, plan=world.plan)
+    return other
+
+
+@pytest.mark.parametrize(
+    ("key", "stage"),
+    [
+        ("walks_per_spot", "capture"),
+        ("truth_columns", "truth"),
+        ("truth_walks", "truth"),
+        ("reference_walks", "references"),
+    ],
+)
+def test_a_stage_takes_as_long_as_its_walks(world: Experiment, key: str, stage: str) -> None:
+    """Expected behaviour: three times the walks, three times that stage, and no other; half the cores, twice all."""
+    once = simulation_seconds(world, 7, 2)
+    more = simulation_seconds(changed(world, **{key: 3 * getattr(world.scene.simulation, key)}), 7, 2)
+    for name, value in once.items():
+        assert more[name] == pytest.approx((3 if name == stage else 1) * value)
+    assert simulation_seconds(world, 7, 1) == pytest.approx({name: 2 * value for name, value in once.items()})
+    assert simulation_seconds(world, 14, 2)["references"] == pytest.approx(2 * once["references"])
+
+
+def test_wavelengths_that_scatter_alike_share_their_walks(world: Experiment) -> None:
+    """Expected behaviour: quick's three lasers walk once; where each scatters by itself, three times."""
+    from dataclasses import replace
+
+    medium = world.object.medium
+    own = medium.sigma_t.copy()
+    own[1] *= 1.1
+    own[2] *= 1.2
+    apart = changed(world)
+    vars(apart).update(object=replace(world.object, medium=replace(medium, sigma_t=own)))
+    once = simulation_seconds(world, 7, 2)
+    assert simulation_seconds(apart, 7, 2) == pytest.approx({name: 3 * value for name, value in once.items()})
+
+
+def test_quick_is_predicted_as_it_was_timed(world: Experiment) -> None:
+    """Expected behaviour: within a factor of 1.5 of what runs on two cores took (docs/decisions/0052)."""
+    found = simulation_seconds(world, 7, 2)
+    for stage, seconds in TIMED_S.items():
+        assert 1 / 1.5 < found[stage] / seconds < 1.5, stage
+
+
+TIMED_S = {"capture": 35.0, "truth": 10.0}
+
+
+def test_references_beside_the_scene_cost_nothing(world: Experiment, tmp_path: Path) -> None:
+    """Expected behaviour: a run takes them from there, so the plan counts those that are missing or of other walks."""
+    there = dict(predict(world, shipped_references(SCENE, "quick")))
+    assert "none to render" in there["references"]
+    assert "minutes" in dict(predict(world, tmp_path))["references"]
+    more = changed(world, reference_walks=100 * world.scene.simulation.reference_walks)
+    assert "minutes" in dict(predict(more, shipped_references(SCENE, "quick")))["references"]

@@ -1,0 +1,120 @@
+"""Connecting to what an earlier program left lit: whatever fails, everything that can be reached is dark afterwards."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from twin_fakes import RIG, Glow
+
+from disco_twin.emulation.bench import FLOOD_LINE, LAMP_LINE
+from disco_twin.emulation.connect import Connector
+from disco_twin.emulation.emulated_rig import Emulation
+from disco_twin.emulation.rig_rules import load_rig_file
+from disco_twin.emulation.selftest import rig_file_of
+from disco_twin.emulation.twin_rig import TwinRig
+from hw.base.errors import DeviceError, InputError
+from hw.devices.mm_ard import MirrorBoard
+from hw.devices.omicron import OmicronLaser
+from hw.devices.omicron_protocol import Mode
+
+LIT = 1 << LAMP_LINE | 1 << FLOOD_LINE | 0b11
+
+
+def left_on() -> Emulation:
+    """Lasers, gates and lamps as a program that was killed together with its guards leaves them."""
+    emulated = Emulation(TwinRig(RIG, Glow(), seed=5))
+    emulated.bench.board.set_pattern(LIT)
+    for head in emulated.bench.heads:
+        head.mode, head.level, head.on_since = int(Mode.BIAS | Mode.RELEASE), 1.0, emulated.clock.now() - 60.0
+    return emulated
+
+
+def connector(emulated: Emulation, folder: Path, change: tuple[str, str] = ("", "")) -> Connector:
+    path = folder / "rig.toml"
+    path.write_text(rig_file_of(RIG, {}).replace(*change, 1))
+    return Connector(load_rig_file(path), emulated.clock, emulated, None)
+
+
+def silent(name: str) -> Callable[[Emulation], None]:
+    """A device whose adapter lives, and which hears nothing."""
+
+    def fall(emulated: Emulation) -> None:
+        emulated.lines[name].firmware.feed = lambda data, now: []  # type: ignore[method-assign]
+
+    return fall
+
+
+@pytest.mark.parametrize("fault", ["laser0 unplugged", "laser0 silent", "laser1 silent", "turntable unplugged"])
+def test_a_device_that_fails_leaves_nothing_else_lit(tmp_path: Path, fault: str) -> None:
+    """Expected: gates and lamps shut, every laser that can be reached off, and the error of the one that failed."""
+    emulated = left_on()
+    name, kind = fault.split()
+    if kind == "silent":
+        silent(name)(emulated)
+    connect = connector(emulated, tmp_path)
+    if kind == "unplugged":
+        emulated.lines[name].unplug()
+    with pytest.raises(DeviceError, match={"laser0": "laser 635 nm", "laser1": "laser 532 nm"}.get(name, name)):
+        connect.connect()
+    assert emulated.bench.board.lines == 0
+    assert [head.on_since is not None for head in emulated.bench.heads] == [f"laser{i}" == name for i in range(3)]
+
+
+def test_a_board_that_fails_leaves_no_laser_on(tmp_path: Path) -> None:
+    emulated = left_on()
+    connect = connector(emulated, tmp_path)
+    emulated.lines["board"].unplug()
+    with pytest.raises(DeviceError, match="mirror board"):
+        connect.connect()
+    assert not any(head.on_since for head in emulated.bench.heads)
+
+
+def test_a_fault_that_nobody_foresaw_leaves_nothing_else_lit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bug in the first laser's driver. Expected: the other lasers are off all the same, and it is raised."""
+    emulated = left_on()
+    connect = connector(emulated, tmp_path)
+    real, seen = OmicronLaser._identify, list[OmicronLaser]()
+
+    def broken(self: OmicronLaser, wavelength_nm: float) -> object:
+        seen.append(self)
+        if len(seen) == 1:
+            raise KeyError("a bug")
+        return real(self, wavelength_nm)
+
+    monkeypatch.setattr(OmicronLaser, "_identify", broken)
+    with pytest.raises(KeyError, match="a bug"):
+        connect.connect()
+    assert emulated.bench.board.lines == 0
+    assert not any(head.on_since for head in emulated.bench.heads[1:])
+
+
+def test_a_wrong_power_is_refused_in_the_dark(tmp_path: Path) -> None:
+    """power_mw beyond what the first laser says of itself: a slip of the pen must not keep the others lit."""
+    emulated = left_on()
+    with pytest.raises(InputError, match=r"lasers\[0\]\.power_mw = 11\.0.*at most 10"):
+        connector(emulated, tmp_path, ("power_mw = 10.0", "power_mw = 11.0")).connect()
+    assert emulated.bench.board.lines == 0 and not any(head.on_since for head in emulated.bench.heads)
+
+
+@pytest.mark.parametrize("moment", ["board", "laser"])
+def test_ctrl_c_in_connecting_is_heard_in_the_dark(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str
+) -> None:
+    """Before the board, or the first laser, has said who it is."""
+    emulated = left_on()
+    driver = MirrorBoard if moment == "board" else OmicronLaser
+    identify, pressed = driver._identify, []
+
+    def interrupted(self: object, *rest: object) -> object:
+        if not pressed:
+            pressed.append(True)
+            signal.raise_signal(signal.SIGINT)
+        return identify(self, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(driver, "_identify", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        connector(emulated, tmp_path).connect()
+    assert emulated.bench.board.lines == 0 and not any(head.on_since for head in emulated.bench.heads)

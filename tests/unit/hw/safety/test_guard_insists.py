@@ -1,0 +1,232 @@
+"""The guard where a laser does not obey, its cable is gone, or the program does not listen."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+import serial
+from guard_fakes import LIMIT_S, Laser, guards_of, wait
+
+from hw.base.clock import WallClock
+from hw.base.errors import SwitchedOff
+from hw.safety import guard
+from hw.safety.ports.protocol_guard import Serial
+from hw.serial.link import Link
+
+
+def test_a_laser_that_was_told_to_emit_is_not_given_up_and_the_user_is_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, lasers: Callable[..., Laser]
+) -> None:
+    """It hears after longer than the guard's patience; the command to emit came in two pieces."""
+    monkeypatch.setattr(guard, "PATIENCE_S", 0.3)
+    laser = lasers()
+    ours, theirs = socket.socketpair()
+    signals, _writer = socket.socketpair()
+    with ours, signals, _writer:
+        done: list[bool] = []
+        program = guard.Program(os.getppid(), signals)
+        thread = threading.Thread(target=lambda: done.append(guard.guard(laser.port, 500000, theirs, program)))
+        thread.start()
+        assert ours.recv(1) == guard.READY
+        for piece in (b"?LO", b"n\r"):
+            ours.sendall(piece)
+            time.sleep(0.1)
+        wait(laser, on=True)
+        laser.deaf = 10**9
+        ours.close()
+        time.sleep(1.5)
+        assert thread.is_alive() and laser.on
+        laser.deaf = 0
+        wait(laser, on=False)
+        thread.join(5.0)
+    assert done == [True]
+    assert caplog.text.count("DOES NOT CONFIRM THAT IT IS OFF") == 1
+    assert [r.levelname for r in caplog.records if "CONFIRM" in r.message] == ["ERROR"]
+
+
+def test_a_laser_that_never_was_told_to_emit_is_given_up_with_a_complaint(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, lasers: Callable[..., Laser]
+) -> None:
+    monkeypatch.setattr(guard, "PATIENCE_S", 0.3)
+    laser = lasers(deaf=10**9)
+    ours, theirs = socket.socketpair()
+    signals, _writer = socket.socketpair()
+    with ours, signals, _writer:
+        ours.close()
+        assert not guard.guard(laser.port, 500000, theirs, guard.Program(os.getppid(), signals))
+    assert caplog.text.count("DOES NOT CONFIRM THAT IT IS OFF") == 1
+
+
+def test_a_cable_that_comes_back_within_ten_minutes_brings_the_switching_off(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, lasers: Callable[..., Laser]
+) -> None:
+    """The port vanishes while the laser emits, and comes back under its name: longer away than the guard's patience."""
+    monkeypatch.setattr(guard, "PATIENCE_S", 0.3)
+    laser, second = lasers(), lasers(on=True)
+    name = tmp_path / "laser"
+    name.symlink_to(laser.port)
+    ours, theirs = socket.socketpair()
+    signals, _writer = socket.socketpair()
+    with ours, signals, _writer:
+        done: list[bool] = []
+        program = guard.Program(os.getppid(), signals)
+        thread = threading.Thread(target=lambda: done.append(guard.guard(str(name), 500000, theirs, program)))
+        thread.start()
+        assert ours.recv(1) == guard.READY
+        name.unlink()
+        laser.close()  # unplugged
+        assert ours.recv(1) == b""  # the program sees its port vanish at once
+        time.sleep(1.0)
+        assert thread.is_alive()
+        name.symlink_to(second.port)
+        wait(second, on=False)
+        thread.join(5.0)
+    assert done == [True]
+
+
+def test_a_port_that_its_last_guard_still_holds_is_waited_for(laser: Laser, ports: Callable[[Laser], Serial]) -> None:
+    held = serial.Serial(laser.port, exclusive=True)
+    until = threading.Timer(0.5, held.close)
+    until.start()
+    assert ports(laser).is_open
+    until.join()
+    with pytest.raises(serial.SerialException, match="exclusively"):
+        serial.Serial(laser.port, exclusive=True)  # and nobody else has it meanwhile
+
+
+def test_what_the_laser_says_reaches_a_program_that_reads_slowly(
+    laser: Laser, ports: Callable[[Laser], Serial]
+) -> None:
+    """More than a socket holds: the guard keeps what the program has not taken, and goes on looking after it."""
+    port = ports(laser)
+    flood = threading.Thread(target=lambda: [os.write(laser.master, b"%07d\n" % k) for k in range(60_000)])
+    flood.start()
+    time.sleep(0.5)
+    got = b""
+    while len(got) < 8 * 60_000:
+        piece = port.read(4096)
+        assert piece, f"silent after {len(got)} bytes"
+        got += piece
+    flood.join()
+    assert got == b"".join(b"%07d\n" % k for k in range(60_000))
+
+
+@pytest.mark.parametrize(
+    ("line", "is_stopped"),
+    [
+        ("7 (python) T 1", True),
+        ("7 (python) t 1", True),
+        ("7 (a) b) T 1", True),
+        ("7 (a T b) S 1", False),
+        ("7 (python) R 1", False),
+    ],
+)
+def test_the_state_of_a_process_is_read_whatever_it_is_called(
+    monkeypatch: pytest.MonkeyPatch, line: str, is_stopped: bool
+) -> None:
+    """Stopped by a signal (T), by a debugger (t); a name may hold brackets and blanks (proc_pid_stat(5))."""
+    monkeypatch.setattr(Path, "read_text", lambda self, errors: line)
+    assert guard.stopped(7) is is_stopped
+
+
+def test_signals_of_before_concern_no_laser_that_is_opened_now(laser: Laser, ports: Callable[[Laser], Serial]) -> None:
+    """A program that obeyed Ctrl-C and goes on may open its lasers again."""
+    first = ports(laser)
+    with suppress(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(1.0)
+    wait(laser, on=False)
+    first.close()
+    port = ports(laser)
+    port.write(b"?LOn\r")
+    wait(laser, on=True)
+    time.sleep(0.2)
+    assert laser.on and port.gone() is None
+
+
+def test_forgetting_what_has_arrived_and_a_program_that_ends_an_open_port(
+    laser: Laser, ports: Callable[[Laser], Serial]
+) -> None:
+    port = ports(laser)
+    port.write(b"?GAS\r")
+    end = time.monotonic() + 2.0
+    while port.in_waiting < 8:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    port.reset_input_buffer()
+    assert port.in_waiting == 0
+    port.close()
+    assert port.gone() == "it is closed" and guards_of(port=laser.port) == []  # the guard has ended when this returns
+
+
+def test_a_command_that_was_cut_short_does_not_spoil_the_switching_off(
+    laser: Laser, ports: Callable[[Laser], Serial]
+) -> None:
+    port = ports(laser)
+    port.write(b"?LOn\r")
+    wait(laser, on=True)
+    laser.said.clear()
+    port.write(b"?MD")  # a program that dies in mid-sentence
+    port.close()
+    assert laser.said[0] == "LOf" and not laser.on
+
+
+def test_a_program_is_told_that_its_laser_has_not_confirmed(lasers: Callable[..., Laser]) -> None:
+    laser = lasers()
+    link = Link("guard://" + laser.port, 500000, "laser 635 nm", WallClock())
+    laser.deaf = 10**9
+    (own,) = guards_of(port=laser.port)
+    os.kill(own, signal.SIGTERM)
+    os.waitid(os.P_PID, own, os.WEXITED | os.WNOWAIT)  # its patience is five seconds
+    with pytest.raises(SwitchedOff, match=r"laser 635 nm is closed: .*HAS NOT CONFIRMED THAT IT IS OFF.*Remedy"):
+        link.require_guard()
+    link.close()
+
+
+def test_closing_is_heard_though_a_child_has_a_copy_of_the_socket(
+    laser: Laser, ports: Callable[[Laser], Serial]
+) -> None:
+    port = ports(laser)
+    port.write(b"?LOn\r")
+    wait(laser, on=True)
+    copy = os.dup(port._open_host().fileno())  # what a child that was forked would hold
+    try:
+        begun = time.monotonic()
+        port.close()
+        assert laser.went_off - begun < LIMIT_S and not laser.on
+    finally:
+        os.close(copy)
+
+
+def test_closing_a_port_whose_guard_was_killed_switches_off(laser: Laser, ports: Callable[[Laser], Serial]) -> None:
+    """Though nobody had asked after the guard before."""
+    port = ports(laser)
+    port.write(b"?LOn\r")
+    wait(laser, on=True)
+    (own,) = guards_of(port=laser.port)
+    os.kill(own, signal.SIGKILL)
+    os.waitid(os.P_PID, own, os.WEXITED | os.WNOWAIT)
+    assert laser.on
+    laser.said.clear()
+    port.close()
+    wait(laser, on=False)
+    assert laser.said[0] == "LOf" and port.gone() == "it is closed"
+
+
+def test_a_link_whose_guard_has_switched_off_says_that_and_not_that_a_cable_is_out(link: Link) -> None:
+    """The rig takes the first for granted when it is made safe, and reports the second."""
+    port = link._port
+    assert isinstance(port, Serial)
+    port.trip()
+    with pytest.raises(SwitchedOff, match="the port of laser 635 nm"):
+        link.write(b"?GAS\r")
+    with pytest.raises(SwitchedOff, match="the port of laser 635 nm"):
+        link.read(0.5)

@@ -1,0 +1,113 @@
+"""R_d against distance alone, and what directions do to it: profile, tilt, and the plainest baselines."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from reconstruct_synthetic import Synthetic, make, rmse_log10
+
+from pipeline.geometry.mesh import vertex_areas
+from pipeline.reconstruct.baselines.dipole import dipole_reflectance, fit_dipole, fit_dipole_laser
+from pipeline.reconstruct.baselines.lambertian import fit_lambertian
+from pipeline.reconstruct.global_term.completion import (
+    deviation,
+)
+from pipeline.reconstruct.global_term.radial_profile import Measured, fit_profile, scatter
+from pipeline.reconstruct.samples.spots import outward_tilt
+
+
+def test_profile_is_recovered() -> None:
+    made = make(noise=0.0, contrast=0.0, hidden=0.0)
+    s = made.samples
+    profile, _ = fit_profile(
+        s.spot_pairs, Measured.of(s, 0), float(s.mesh.edges_unique_length.mean()), s.direction_bias
+    )
+    got = s.vertex_pairs.mean(profile)
+    assert rmse_log10(0.5 * (got + got.T), made.truth[0]) < 0.02
+
+
+def test_deviation_and_scatter_grow_with_distance() -> None:
+    d = np.linspace(0, 40, 50)
+    assert (np.diff(deviation(d)) >= 0).all()
+    assert (np.diff(scatter(d)) > 0).all()
+
+
+@pytest.mark.parametrize("absorption", [0.001, 0.1])
+def test_dipole_energy_and_fit(absorption: float) -> None:
+    """Rationale: the integral over the plane is Jensen's closed form; the fit returns what it was given."""
+    scattering, eta = 1.5, 1.3
+    r = np.geomspace(1e-4, 4e3, 200_000)
+    total = np.trapezoid(2 * np.pi * r * dipole_reflectance(r, scattering, absorption, eta), r)
+    inner = -1.440 / eta**2 + 0.710 / eta + 0.668 + 0.0636 * eta
+    boundary = (1 + inner) / (1 - inner)
+    albedo = scattering / (scattering + absorption)
+    root = np.sqrt(3 * (1 - albedo))
+    exact = albedo / 2 * (1 + np.exp(-4 / 3 * boundary * root)) * np.exp(-root)  # Jensen et al. 2001, eq. 15
+    assert total == pytest.approx(exact, rel=2e-3)
+    made = make(spots=40, noise=0.0, contrast=0.0, hidden=0.2)
+    kernel = made.samples.spot_pairs.mean(lambda d: dipole_reflectance(d, scattering, absorption, eta))
+    values = np.where(np.isfinite(made.samples.values), kernel, np.nan).astype(np.float32)
+    found = fit_dipole_laser(replace(made.samples, values=values), 0)
+    assert found == pytest.approx((scattering, absorption), rel=0.02)
+
+
+def test_dipole_model_depends_on_distance_alone(small: Synthetic) -> None:
+    model = fit_dipole(small.samples)
+    np.testing.assert_allclose(model.reflectance[0], model.reflectance[0].T, rtol=1e-6)
+
+
+def test_lambertian_albedo_is_the_energy_of_the_spots(small: Synthetic) -> None:
+    model = fit_lambertian(small.samples)
+    area = vertex_areas(small.samples.mesh)
+    albedo = np.diag(model.reflectance[0]) * area
+    assert np.count_nonzero(model.reflectance[0]) == len(area)
+    truth = small.truth[0] @ area
+    assert np.std(albedo / truth) < 0.08
+    assert albedo.mean() == pytest.approx(truth.mean(), rel=0.03)
+
+
+def test_baselines_are_not_misled_by_the_views(small: Synthetic) -> None:
+    """Rationale: samples darker by the direction that they were seen from; the fits see through it."""
+    s = make(spots=60, noise=0.0, contrast=0.0).samples
+    direction_bias = np.random.default_rng(4).uniform(-0.8, 0.2, s.values[0].shape)
+    leaning = replace(
+        s, direction_bias=direction_bias, values=s.values * np.exp(0.5 * direction_bias).astype(np.float32)
+    )
+    np.testing.assert_allclose(
+        fit_lambertian(leaning).reflectance.sum(), fit_lambertian(s).reflectance.sum(), rtol=0.02
+    )
+    np.testing.assert_allclose(fit_dipole_laser(leaning, 0), fit_dipole_laser(s, 0), rtol=0.05)
+
+
+def test_profile_is_that_of_all_directions() -> None:
+    """Rationale: samples brighter where one looks along the light's way; the tilted fit takes it out again."""
+    made = make(noise=0.0, contrast=0.0, hidden=0.0)
+    s = made.samples
+    direction_bias = np.random.default_rng(4).uniform(-0.8, 0.2, s.values[0].shape)
+    edge = float(s.mesh.edges_unique_length.mean())
+    seen = Measured.of(replace(s, values=s.values * np.exp(0.5 * direction_bias).astype(np.float32)), 0)
+    plain, tilted = (
+        s.vertex_pairs.mean(fit_profile(s.spot_pairs, seen, edge, t)[0]).sum() / made.truth[0].sum()
+        for t in (np.zeros_like(direction_bias), direction_bias)
+    )
+    assert plain < 0.9
+    assert tilted == pytest.approx(1.0, abs=0.01)
+
+
+def test_tilt_has_the_sign_of_the_view() -> None:
+    """Rationale: a camera far away along x sees the light of a spot at the pole of z along its way on the +x side."""
+    s = make(spots=2).samples
+    pole = replace(
+        s.spots,
+        position=np.array([[0, 0, 10.0]] * 2),
+        normal=np.array([[0, 0, 1.0]] * 2),
+        direction=np.array([[0, 0, -1.0], [-0.6, 0, -0.8]]),  # the second laser stands on the +x side
+    )
+    at_vertices, at_spots = outward_tilt(s.mesh, pole, np.array([1e6, 0, 0]))
+    x, _, z = np.asarray(s.mesh.vertices).T
+    near = (z > 8) & (np.abs(x) > 2)
+    np.testing.assert_array_equal(np.sign(at_vertices[0, near]), np.sign(x[near]))
+    np.testing.assert_allclose(at_spots[0, near], 0.0, atol=1e-9)
+    np.testing.assert_array_equal(np.sign(at_spots[1, near]), -np.sign(x[near]))

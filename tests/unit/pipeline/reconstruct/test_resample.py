@@ -1,0 +1,144 @@
+"""The fast way from records to readings against the plain one in double precision, on records of all kinds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from reconstruct_capture import ETA, RADIUS, SENSOR, rig
+from scipy import ndimage
+
+from hw.base.errors import DiscoError
+from hw.record import RawImage
+from pipeline.calibrate.calibration import Calibration, nominal_calibration
+from pipeline.plan.plan import make_plan
+from pipeline.reconstruct.samples.image_operators import ImageOperator, bilinear_reading, footprint_reading
+from pipeline.reconstruct.samples.resample import Sums, ViewReader, resample
+from pipeline.stream.stream import ImageMeta, StreamReader, StreamWriter
+
+SHAPE = (80, 96)
+MASK = np.outer([1, -2, 1], [1, -2, 1]) / 6.0
+
+
+def noise_squared(image: np.ndarray) -> np.ndarray:
+    """Immerkaer's estimate of each pixel's noise variance."""
+    return np.asarray(ndimage.convolve(image, MASK, mode="nearest") ** 2)
+
+
+def record(index: int) -> RawImage:
+    """A record with all exponents and charges side by side, and a saturated pixel in every fifth."""
+    rng = np.random.default_rng(index)
+    charge = rng.integers(60, 4000, SHAPE, dtype=np.uint16)
+    if index % 5 == 0:
+        charge[40, 48] = SENSOR.saturation_dn
+    return RawImage(rng.integers(0, SENSOR.steps, SHAPE, dtype=np.uint8), charge)
+
+
+def power(index: int) -> float:
+    return 0.0 if index % 29 == 3 else 0.01 * (1 + index % 7)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, trimesh.Trimesh, Calibration]:
+    folder = tmp_path_factory.mktemp("capture")
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=RADIUS)
+    mesh.apply_translation([0.0, 0.0, 6.0])  # the cameras see it up to the image's upper border
+    plan = make_plan(rig(), mesh)
+    with StreamWriter(folder, plan) as stream:
+        for index, address in enumerate(plan.addresses()):
+            stream.append(address, record(index), ImageMeta(0.0, power(index), 0.0, 0, 0))
+    plain = nominal_calibration(rig(), SENSOR)
+    views = [
+        v.model_copy(update={"radiance_factor": (1.2 + 0.1 * k, 0.9 - 0.1 * k)}) for k, v in enumerate(plain.views)
+    ]
+    return folder, mesh, plain.model_copy(update={"views": tuple(views)})
+
+
+def readings_of(mesh: trimesh.Trimesh, calibration: Calibration, view: int) -> dict[str, ImageOperator]:
+    camera = calibration.view_camera(view)
+    ways = {"footprint": footprint_reading, "bilinear": bilinear_reading}
+    return {way: reading(mesh, camera, ETA, 75.0) for way, reading in ways.items()}
+
+
+def test_equals_the_plain_computation(capture: tuple[Path, trimesh.Trimesh, Calibration]) -> None:
+    """Rationale: values, noise, shot noise and glow from whole images in double precision, image by image.
+    Expected behaviour: equal to single precision, white balance included; what is saturated or hidden counts nowhere,
+    nor do unlit images.
+    """
+    folder, mesh, calibration = capture
+    with StreamReader(folder) as stream:
+        plan = stream.plan
+        transmitted = np.where(np.arange(len(plan.spots)) % 6 == 1, 0.0, 0.9 - 0.01 * np.arange(len(plan.spots)))
+        hidden = {(v, s): np.arange(s, 160, 3) for v in range(plan.views) for s in range(0, len(plan.spots), 4)}
+        ways = [readings_of(mesh, calibration, view) for view in range(plan.views)]
+        sights = [ViewReader.of(view, calibration, mesh, ways[view]) for view in range(plan.views)]
+        parts = list(resample(stream, calibration, sights, transmitted, hidden))
+    assert {a.spot for p in parts for a in p.task.addresses} == set(np.flatnonzero(transmitted).tolist())
+    border = np.pad(np.zeros((SHAPE[0] - 2, SHAPE[1] - 2)), 1, constant_values=1.0).ravel()
+    blank = 0
+    for part in parts:
+        sight = part.task.sight
+        glow = np.zeros(SHAPE)
+        noise = {way: np.zeros((2, len(rows))) for way, rows in sight.rows.items()}
+        for i, address in enumerate(part.task.addresses):
+            index = plan.index(address)
+            assert (address in part.lost) == (part.scale[i] == 0.0) == (power(index) == 0.0)
+            if power(index) == 0.0:
+                assert all(np.isnan(part.value[way][i]).all() for way in part.value)
+                continue
+            image = calibration.radiance(record(index), sight.view, part.task.laser)
+            scale = np.pi / (transmitted[address.spot] * power(index))
+            assert part.scale[i] == pytest.approx(scale * calibration.factor(sight.view, part.task.laser))
+            radiance, shot = image.radiance.astype(np.float64) * scale, image.variance.ravel() * scale**2
+            glow += radiance
+            for way, rows in sight.rows.items():
+                operator = ways[sight.view][way].operator[rows]
+                unread = abs(operator) @ image.saturated.ravel().astype(float) > 0
+                unread |= np.isin(rows, hidden.get((sight.view, address.spot), []))
+                assert np.array_equal(np.isnan(part.value[way][i]), unread)
+                blank += int(unread.sum())
+                close = 3e-6 * (abs(operator) @ abs(radiance).ravel())
+                assert (abs(part.value[way][i] - operator @ radiance.ravel())[~unread] <= close[~unread]).all()
+                squared = operator.multiply(operator)
+                noise[way] += ~unread * [squared @ noise_squared(radiance).ravel(), squared @ shot]
+        np.testing.assert_allclose(part.sums.glow * sight.gain, glow[sight.window], rtol=1e-5, atol=1e-6 * glow.max())
+        for way, operator in sight.operators.items():
+            squared = operator.multiply(operator)
+            np.testing.assert_allclose(squared @ part.sums.shot.ravel() + part.alone[way][1], noise[way][1], rtol=1e-5)
+            fast = squared @ part.sums.noise_variance().ravel() + part.alone[way][0]
+            # At the image's border the plain mask sees a pixel twice; the fast way takes the next pixel's estimate.
+            inside = ways[sight.view][way].operator[sight.rows[way]] @ border == 0
+            assert 10 < inside.sum() <= len(fast)
+            # The lens's gain is applied after the differences, not before: it is not quite constant over three pixels.
+            np.testing.assert_allclose(fast[inside], noise[way][0][inside], rtol=2e-3)
+    assert blank > 100
+    read = [plan.index(a) for p in parts for a in p.task.addresses if power(plan.index(a)) > 0]
+    assert sum(part.saturated for part in parts) == sum(index % 5 == 0 for index in read)
+    assert 0 < sum(part.hidden for part in parts) < blank
+    assert any(part.lost for part in parts)
+
+
+def test_a_record_that_does_not_fit_the_sensor_is_refused(
+    capture: tuple[Path, trimesh.Trimesh, Calibration], tmp_path: Path
+) -> None:
+    folder, mesh, calibration = capture
+    ten_bits = calibration.model_copy(update={"sensor": SENSOR.__class__(**{**vars(SENSOR), "bits": 10})})
+    sight = ViewReader.of(0, calibration, mesh, readings_of(mesh, calibration, 0))
+    with StreamReader(folder) as stream, pytest.raises(DiscoError, match="do not fit the sensor"):
+        list(resample(stream, ten_bits, [sight], np.ones(len(stream.plan.spots)), {}))
+
+
+def test_noise_estimate_is_unbiased_and_blind_to_slopes() -> None:
+    """Outside truth: the mean of estimates over images is the variance that was put in; a ramp adds nothing."""
+    rng = np.random.default_rng(0)
+    ramp = np.add.outer(np.arange(200.0), 3 * np.arange(200.0))
+    sums = Sums.zeros(ramp.shape)
+    sums.add(ramp, ramp)
+    assert sums.noise_variance().max() < 1e-12
+    sums.add(ramp + 2.0 * rng.standard_normal(ramp.shape), ramp)
+    measured = sums.noise_variance()
+    # 36 neighbours share pixels: the mean's deviation is about that of a ninth of the pixels
+    z = (measured.mean() - 4.0) / (4.0 * np.sqrt(2 / (measured.size / 9)))
+    assert abs(z) < 4

@@ -1,0 +1,79 @@
+"""From radiosity to images: closed forms on a sphere and a plane, geometry, occlusion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from pipeline.geometry.camera import PinholeCamera, look_at
+from pipeline.geometry.fresnel import transmittance
+from pipeline.relight.view_matrix import relit_image, view_matrix
+
+
+def camera(position: tuple[float, float, float] = (450.0, 0.0, 80.0), focal: float = 1300.0) -> PinholeCamera:
+    pose = look_at(position, (0, 0, 0))
+    return PinholeCamera(96, 62, np.array([focal, focal]) / 2, np.array([48.0, 31.0]), np.zeros(5), pose)
+
+
+def test_a_sphere_of_constant_radiosity_shows_f_t() -> None:
+    """Expected: L = F_t(w_o) / pi * B with the sphere's exact normals, falling to zero at the rim."""
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=20)
+    mesh.vertices *= np.sqrt(4 * np.pi * 400 / mesh.area)  # the inscribed mesh is 0.1 % too small
+    view = view_matrix(mesh, camera(), 1.3, supersample=4)
+    image = view.image(np.full((2, len(mesh.vertices)), 5.0))
+    assert image.shape == (2, 62, 96)
+    assert image.dtype == np.float32
+    origins, directions = camera().rays(camera().pixel_centres(8))
+    b = (origins * directions).sum(axis=1)
+    square = b**2 - (origins**2).sum(axis=1) + 400
+    points = origins + directions * (-b - np.sqrt(np.maximum(square, 0)))[:, None]
+    exact = np.where(square > 0, transmittance(-(points * directions).sum(axis=1) / 20, 1.3), 0) * 5 / np.pi
+    exact = exact.reshape(62, 8, 96, 8).mean(axis=(1, 3))
+    assert np.sqrt(((image[0] - exact) ** 2).mean() / (exact**2).mean()) < 4e-3
+    assert image[1].sum() == pytest.approx(exact.sum(), rel=1e-3)
+    assert view.coverage.sum() == pytest.approx((square > 0).sum() / 64, rel=2e-3)
+
+
+def test_radiosity_is_linear_on_faces_and_seen_where_the_camera_projects_it() -> None:
+    corners = np.array([[0, -30.0, -20], [0, 30, -20], [0, 30, 20], [0, -30, 20]])
+    mesh = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    distorted = replace(camera((450.0, 30.0, 80.0)), distortion=np.array([-0.9, 0.3, 0.01, -0.02, 0.0]))
+    view = view_matrix(mesh, distorted, 1.0, supersample=1)
+    image = view.image((100 + corners @ [0, 2.0, -1.0])[None])[0]
+    inside = np.argwhere(view.coverage == 1)
+    origins, directions = distorted.rays(inside[:, ::-1] + 0.5)
+    points = origins - directions * (origins[:, :1] / directions[:, :1])
+    expected = (100 + points @ [0, 2.0, -1.0]) / np.pi
+    np.testing.assert_allclose(image[tuple(inside.T)], expected, rtol=1e-5)
+    pixels, _ = distorted.project(points)
+    np.testing.assert_allclose(pixels, inside[:, ::-1] + 0.5, atol=1e-6)
+    assert len(inside) > 1000
+
+
+def test_flat_faces_with_creases_keep_their_own_normals() -> None:
+    box = trimesh.creation.box(extents=(20, 30, 24))
+    image = relit_image(np.ones((1, 8)), box, camera((450.0, 0.0, 0.0), focal=2000.0), 1.3)[0]
+    assert image[31, 48] == pytest.approx(float(transmittance(1.0, 1.3)) / np.pi, rel=1e-4)
+    assert image[31, 35:60].min() > 0.999 * image[31, 48]
+
+
+def test_what_stands_in_front_hides_and_the_inside_is_black() -> None:
+    near = trimesh.creation.box(extents=(2, 20, 20), transform=trimesh.transformations.translation_matrix([20, 0, 0]))
+    far = trimesh.creation.box(extents=(2, 20, 20), transform=trimesh.transformations.translation_matrix([-20, 0, 0]))
+    both = trimesh.util.concatenate([near, far])
+    radiosity = np.concatenate([np.zeros(8), np.ones(8)])[None]
+    image = relit_image(radiosity, both, camera((450.0, 0.0, 0.0)), 1.3)
+    assert image.max() == 0
+    inverted = trimesh.Trimesh(near.vertices, near.faces[:, ::-1], process=False)
+    assert relit_image(np.ones((1, 8)), inverted, camera(), 1.3).max() == 0
+
+
+def test_supersampling_converges_at_the_rim() -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=20)
+    radiosity = np.random.default_rng(0).random((1, len(mesh.vertices)))
+    fine = relit_image(radiosity, mesh, camera(), 1.3, supersample=16)
+    errors = [np.abs(relit_image(radiosity, mesh, camera(), 1.3, supersample=s) - fine).mean() for s in (1, 4)]
+    assert errors[1] < errors[0] / 4
