@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_twin.emulation.selftest import rig_file_of
-from disco_twin.experiment.run_folder import require_folder, write_atomically
+from disco_twin.experiment.run_folder import require_folder
 from hw.base.clock import WallClock
 from hw.base.errors import DiscoError, InputError
+from hw.base.files import take_lock, write_atomically
 from hw.interface import Aim
 from pipeline.geometry.nominal_rig import RigConfig
 
@@ -86,11 +86,9 @@ def _alone_in(folder: Path) -> Iterator[None]:
     """
     lock = os.open(folder, os.O_RDONLY)
     try:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
+        if not take_lock(lock):
             problem, remedy = "an emulator that is running serves its devices here", "end it, or choose another --ports"
-            raise InputError(problem, file=folder, remedy=remedy) from error
+            raise InputError(problem, file=folder, remedy=remedy)
         yield
     finally:
         os.close(lock)

@@ -8,7 +8,6 @@ The truth goes to the pipeline here on purpose, into folders of the twin's own, 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +20,10 @@ from scipy.spatial.transform import Rotation
 from disco_twin.camera.lens import Glare
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.pipeline_process import reconstruct_apart
-from disco_twin.experiment.run_folder import RunFolder, write_atomically
+from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.faults.actual_rig import ActualRig, actual_rig
 from hw.base.errors import InputError
+from hw.base.files import write_json
 from pipeline.calibrate.calibration import Calibration, ProjectorCalibration, nominal_calibration, pair, pose_rows
 from pipeline.geometry.nominal_rig import RigConfig
 
@@ -148,5 +148,5 @@ def score_budget(experiment: Experiment, folder: RunFolder, method: str) -> list
         reconstruct_apart(scene, variant, (method,), given)
         rows += [{"calibration": name} | row for row in score_relit_images(experiment, variant, (method,))]
     record = {"format_version": FORMAT_VERSION, "method": method, "rows": rows}
-    write_atomically(folder.twin / RECORD, (json.dumps(record, indent=1) + "\n").encode())
+    write_json(folder.twin / RECORD, record)
     return rows

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 from collections.abc import Sequence
@@ -14,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_twin.experiment.experiment import Experiment
-from disco_twin.experiment.run_folder import RunFolder, write_atomically
+from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.run.simulate import reference_path
 from hw.base.config import Strict, read_json
 from hw.base.errors import InputError
+from hw.base.files import write_json
 
 if TYPE_CHECKING:
     from pipeline.geometry.nominal_rig import CameraConfig
@@ -45,7 +45,7 @@ def score_run(experiment: Experiment, folder: RunFolder, methods: Sequence[str])
         "relit": score_relit_images(experiment, folder, methods),
         "reflectance": score_models(folder, methods),
     }
-    write_atomically(scores_file(folder), json.dumps(scores, indent=1).encode())
+    write_json(scores_file(folder), scores)
 
 
 def scores_file(folder: RunFolder) -> Path:

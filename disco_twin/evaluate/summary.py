@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from disco_twin.evaluate.simulation_noise import measured_noise
-from disco_twin.experiment.run_folder import RunFolder, write_atomically
+from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.scene.scene import Scene
 from hw.base.config import read_json
 from hw.base.errors import InputError
+from hw.base.files import write_json
 from pipeline.stream.stream import StreamReader
 
 FORMAT_VERSION = 1
@@ -59,7 +59,7 @@ def make_summary(
 
 def write_summary(summary: dict[str, Any], path: Path) -> None:
     """Strict JSON: a NaN is refused here rather than by the next reader."""
-    write_atomically(path, (json.dumps(summary, indent=1, allow_nan=False) + "\n").encode())
+    write_json(path, summary)
 
 
 def load_summary(path: Path) -> dict[str, Any]:

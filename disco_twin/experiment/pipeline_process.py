@@ -11,10 +11,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from disco_twin.experiment.run_folder import RunFolder, write_atomically
+from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.scene.scene import Scene
 from hw.base.config import read_json
 from hw.base.errors import DiscoError
+from hw.base.files import write_json
 from pipeline.records import PipelineRecord
 
 REQUEST = "request.json"
@@ -42,7 +43,7 @@ def reconstruct_apart(
     The peak is the process's own word: `wait4` would count what our process held when it started the child.
     """
     request = folder.work / REQUEST
-    write_atomically(request, json.dumps(pipeline_inputs(scene, methods), indent=1).encode())
+    write_json(request, pipeline_inputs(scene, methods))
     command = [sys.executable, "-m", "pipeline", str(folder.capture), str(folder.work), "--request", str(request)]
     command += ["--until-stdin-closes", *(() if calibration is None else ("--calibration", str(calibration)))]
     with tempfile.TemporaryFile("w+") as errors:

@@ -7,7 +7,6 @@ OUT/twin/       what the pipeline never sees: the simulated responses, true R_d,
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import logging
@@ -21,6 +20,7 @@ from typing import Annotated, Any, Literal
 
 from hw.base.config import Strict, as_table, read_json
 from hw.base.errors import DiscoError, InputError
+from hw.base.files import take_lock, write_atomically, write_json
 from hw.base.resources import measured
 from pipeline.stream.files import IMAGES, JOURNAL
 
@@ -189,12 +189,10 @@ class RunFolder:
         """No other process works in the folder meanwhile."""
         handle = os.open(self.root, os.O_RDONLY)
         try:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
+            if not take_lock(handle):
                 raise DiscoError(
                     f"{self.root}: another process works in this folder. Remedy: wait for it, or choose another --out"
-                ) from error
+                )
             yield
         finally:
             os.close(handle)
@@ -225,7 +223,7 @@ class RunFolder:
             "identity": self.identity,
             "stages": [asdict(s) for s in self.stages.values()],
         }
-        write_atomically(self.journal, json.dumps(data, indent=1).encode())
+        write_json(self.journal, data)
 
 
 class _Journal(Strict):
@@ -256,23 +254,6 @@ def _barely_begun(root: Path) -> bool:
     """Whether a folder without a journal is one that a run could not finish making (a full disk, a kill), or empty."""
     files = {"scene.toml", "scene.toml.part", "stages.json.part"}
     return all(path.name in files or (path.name in FOLDERS and not any(path.iterdir())) for path in root.iterdir())
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file as a whole: a reader, or a run after a crash, sees the old content or the new.
-
-    Where the disk refuses, the error names the file, and nothing is left of what was not written in full.
-    """
-    temporary = path.with_name(path.name + ".part")
-    try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def content_key(*parts: Any) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,6 +21,7 @@ from disco_twin.light.sources import BeamSource, Source
 from disco_twin.light.transport import Transport
 from disco_twin.object.build import TwinObject
 from hw.base.errors import refused_by_the_disk
+from hw.base.files import replacing
 from hw.interface import Aim
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.nominal_rig import RigConfig
@@ -98,15 +98,12 @@ class SpotResponses:
         name = hashlib.sha256(repr((self._key, chunk, self.walks, self.seed)).encode()).hexdigest()[:16]
         path = self.scratch / f"spots-{name}.npy"
         if not path.exists():
-            partial = path.with_suffix(".part")
             simulated = self._simulate(chunk)
             try:
-                with partial.open("wb") as file:
+                with replacing(path) as file:
                     np.save(file, simulated)
-            except OSError as error:  # NumPy's has no file name
-                partial.unlink(missing_ok=True)
+            except OSError as error:
                 raise refused_by_the_disk(error, path) or error from error
-            os.replace(partial, path)
         return np.asarray(np.load(path, mmap_mode="r"))
 
     def _simulate(self, chunk: tuple[Aim, ...]) -> F32:

@@ -6,9 +6,6 @@ function of vertex v: cosine in, cosine out, which is what is reciprocal.
 
 from __future__ import annotations
 
-import os
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from disco_twin.light.balance import EnergyBalance
-from hw.base.errors import InputError
+from hw.base.files import load_arrays, save_arrays
 from pipeline.geometry.fresnel import mean_transmittance
 
 if TYPE_CHECKING:
@@ -29,7 +26,8 @@ if TYPE_CHECKING:
 F64 = NDArray[np.float64]
 
 REPLICATES = 8
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+ARRAYS = ("columns", "mean", "standard_error", "area")
 
 
 @dataclass(frozen=True)
@@ -49,36 +47,15 @@ class Truth:
     def save(self, path: Path) -> None:
         """Write an .npz, replacing any older one at once."""
         balance = {f"balance_{k}": getattr(self.balance, k) for k in EnergyBalance.__dataclass_fields__}
-        partial = path.with_suffix(".part")
-        with partial.open("wb") as file:
-            np.savez(
-                file, format_version=FORMAT_VERSION, columns=self.columns, mean=self.mean,
-                standard_error=self.standard_error, area=self.area, **balance,
-            )  # fmt: skip
-        os.replace(partial, path)
+        save_arrays(path, FORMAT_VERSION, {name: getattr(self, name) for name in ARRAYS} | balance)
 
     @classmethod
     def load(cls, path: Path) -> Truth:
-        """Read what `save` wrote; a damaged file or another format version is refused."""
-        try:
-            with path.open("rb") as stored, np.load(stored, allow_pickle=False) as file:
-                data = {name: file[name] for name in file}
-        except FileNotFoundError as error:
-            raise InputError("is missing", file=path, remedy="disco-twin run computes it") from error
-        except (OSError, zipfile.BadZipFile, zlib.error, ValueError, EOFError, TypeError) as error:
-            remedy = "delete it, disco-twin run computes it again"
-            raise InputError("is damaged", file=path, remedy=remedy) from error
-        try:
-            if int(data["format_version"]) != FORMAT_VERSION:
-                raise InputError(
-                    "unknown format", file=path, key="format_version", value=int(data["format_version"]),
-                    allowed=str(FORMAT_VERSION), remedy="run the stage again",
-                )  # fmt: skip
-            balance = EnergyBalance(**{k: data[f"balance_{k}"] for k in EnergyBalance.__dataclass_fields__})
-            return cls(data["columns"], data["mean"], data["standard_error"], data["area"], balance)
-        except KeyError as error:
-            remedy = "delete it, disco-twin run computes it again"
-            raise InputError(f"is damaged (it lacks {error})", file=path, remedy=remedy) from error
+        """Read what `save` wrote. Raises: InputError for a missing or damaged file, and for another format version."""
+        names = (*ARRAYS, *(f"balance_{k}" for k in EnergyBalance.__dataclass_fields__))
+        _, data = load_arrays(path, FORMAT_VERSION, "delete it, disco-twin run computes it again", names)
+        balance = EnergyBalance(**{k: data[f"balance_{k}"] for k in EnergyBalance.__dataclass_fields__})
+        return cls(data["columns"], data["mean"], data["standard_error"], data["area"], balance)
 
 
 def hat_areas(transport: Transport, basis: sparse.csr_matrix) -> F64:

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_twin.experiment.run_folder import write_atomically
 from disco_twin.report import calibration as report_calibration
 from disco_twin.report import figures
+from hw.base.files import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 from disco_twin.emulation.connect import assembled
 from disco_twin.emulation.rig_file import EMULATED, DevicesFile
 from disco_twin.emulation.rig_rules import load_rig_file, require_reach, require_same, require_scene
-from disco_twin.experiment.run_folder import content_key, require_folder, write_atomically
+from disco_twin.experiment.run_folder import content_key, require_folder
 from hw.base.errors import InputError, naming
+from hw.base.files import write_atomically
 from pipeline.capture.loop import capture
 from pipeline.stream.files import IMAGES
 from pipeline.stream.stream import StreamReader

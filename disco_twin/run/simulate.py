@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from disco_twin.experiment.experiment import Experiment, reference_key
-from disco_twin.experiment.run_folder import RunFolder, write_atomically
+from disco_twin.experiment.run_folder import RunFolder
 from hw.base.errors import InputError
+from hw.base.files import write_atomically
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.nominal_rig import CameraConfig, FaultsConfig
 from pipeline.plan.visibility import require_in_sight

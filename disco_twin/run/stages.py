@@ -12,11 +12,12 @@ from rich.console import Console
 
 from disco_twin.experiment.experiment import Experiment, identity, left_out_by_the_twin
 from disco_twin.experiment.pipeline_process import load_results, pipeline_inputs, reconstruct_apart, stale
-from disco_twin.experiment.run_folder import RunFolder, content_key, source_key, write_atomically
+from disco_twin.experiment.run_folder import RunFolder, content_key, source_key
 from disco_twin.run.progress import Report, run_log, stage_bar
 from disco_twin.scene.scene import Profile, Scene, load_scene
 from hw.base.config import read_json
 from hw.base.errors import InputError, refused_by_the_disk
+from hw.base.files import write_atomically
 from pipeline.capture.loop import Interrupted
 from pipeline.reconstruct.settings import Method
 from pipeline.records import StageFigures

@@ -20,6 +20,7 @@ from pydantic import Field
 
 from hw.base.config import Strict, as_table, check
 from hw.base.errors import InputError
+from hw.base.files import write_atomically
 from hw.interface import Aim
 from hw.record import RadianceImage, RawImage, Sensor, to_radiance
 from pipeline.geometry.camera import PinholeCamera, turn
@@ -151,7 +152,7 @@ class Calibration(Strict):
 
     def save(self, path: Path) -> None:
         """Write as JSON; numbers keep all their digits."""
-        path.write_text(self.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        write_atomically(path, (self.model_dump_json(indent=1) + "\n").encode())
 
     @classmethod
     def load(cls, path: Path) -> Self:

@@ -27,13 +27,13 @@ from pydantic import Field
 
 from hw.base.config import NearbyFile, Strict, as_table, load_toml
 from hw.base.errors import InputError
+from hw.base.files import write_atomically
 from hw.camera.bracket import Bracket
 from hw.interface import Aim
 from hw.record import Sensor
 from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.plan.plan import ImageAddress, Plan
 from pipeline.records import RigFile, SensorFile
-from pipeline.stream.files import replace_file
 from pipeline.stream.layout import ImageMeta
 from pipeline.stream.stream import StreamWriter
 
@@ -84,9 +84,11 @@ def import_capture(folder: Path, out: Path, progress: Callable[[int, int], None]
         described.saturation_dn,
     )
     with StreamWriter(out, plan) as stream:
-        replace_file(out / "scan.ply", _scan(described.scan))
-        replace_file(out / "rig.json", RigFile(format_version=1, rig=described.rig).model_dump_json(indent=1).encode())
-        replace_file(
+        write_atomically(out / "scan.ply", _scan(described.scan))
+        write_atomically(
+            out / "rig.json", RigFile(format_version=1, rig=described.rig).model_dump_json(indent=1).encode()
+        )
+        write_atomically(
             out / "sensor.json",
             SensorFile(format_version=1, sensor=described.sensor).model_dump_json(indent=1).encode(),
         )

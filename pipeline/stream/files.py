@@ -116,16 +116,6 @@ def write_at(file: int, data: bytes, offset: int) -> None:
         data, offset = data[done:], offset + done
 
 
-def replace_file(path: Path, data: bytes) -> None:
-    """Write a small file so that a crash leaves the old one or the new one."""
-    fresh = path.with_name(path.name + ".new")
-    with fresh.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    fresh.replace(path)
-
-
 def storage_error(folder: Path, stored: int, error: OSError) -> StorageError:
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     reason, remedy = ("the disk is full", "make room") if full else (error.strerror or str(error), "check the disk")

@@ -7,7 +7,6 @@ reported with its address, and no other. POSIX only (pread, flock).
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import zlib
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Self
 
 from hw.base.errors import DiscoError, InputError
+from hw.base.files import take_lock, write_atomically
 from hw.base.resources import usable_cores
 from hw.record import RawImage
 from pipeline.plan.plan import ImageAddress, Plan, load_plan
@@ -28,7 +28,6 @@ from pipeline.stream.files import (
     StorageError,
     StreamFiles,
     end_of,
-    replace_file,
     storage_error,
     write_at,
 )
@@ -81,10 +80,8 @@ class StreamWriter:
         self._pool = ThreadPoolExecutor(usable_cores(), thread_name_prefix="encode")
 
     def _lock(self, folder: Path) -> None:
-        try:
-            fcntl.flock(self._files.images, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise DiscoError(f"{folder}: another process is capturing into this folder") from error
+        if not take_lock(self._files.images):
+            raise DiscoError(f"{folder}: another process is capturing into this folder")
 
     def _claim(self, folder: Path) -> None:
         """Make sure that the folder is this plan's; a header or plan.json that was damaged is written anew."""
@@ -97,7 +94,7 @@ class StreamWriter:
         path = folder / PLAN
         try:
             if not path.exists() or path.read_bytes() != text:
-                replace_file(path, text)
+                write_atomically(path, text)
             for file, magic in ((files.images, IMAGES_MAGIC), (files.journal, JOURNAL_MAGIC)):
                 header = pack_header(magic, self.plan.digest)
                 if os.pread(file, HEADER_BYTES, 0) != header:

@@ -11,13 +11,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from tests.validation.significance import assert_z, z_of_replicates
 
 from disco_twin.light.sampling import Rng
 from disco_twin.light.sources import light_source
 from disco_twin.light.transport import mesh_scene
 from pipeline.relight.irradiance import hat_moments, irradiance
 from pipeline.relight.lights import Directional, Light, Uniform, shipped_lights
-from tests.validation.significance import assert_z, z_of_replicates
 
 REPLICATES, PHOTONS = 16, 1 << 18
 LIGHTS = {light.name: light for light in shipped_lights((150.0, 400.0, 110.0))}

@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from tests.validation.significance import assert_z
 
 from disco_twin.experiment.experiment import reference_key
 from disco_twin.light.references import load_reference, render_reference
@@ -17,7 +18,6 @@ from disco_twin.object.build import build_object
 from disco_twin.run.simulate import reference_path
 from disco_twin.scene.scene import load_scene
 from pipeline.geometry.camera import PinholeCamera
-from tests.validation.significance import assert_z
 
 REPLICATES, WALKS, BLOCK = 16, 200_000, 31  # large blocks: the noise of small ones is far from normal
 LIGHT = "edge"

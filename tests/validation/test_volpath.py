@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from tests.validation.significance import assert_z, z_of_difference
 
 from benchmarks.volpath import volpath_scene
 from disco_twin.light.references import render_reference
@@ -22,7 +23,6 @@ from disco_twin.object.build import Boundary, Medium, TwinObject, build_object
 from disco_twin.scene.scene import load_scene
 from pipeline.geometry.camera import PinholeCamera, look_at
 from pipeline.relight.lights import Directional, Uniform
-from tests.validation.significance import assert_z, z_of_difference
 
 BLOCK, PIXELS = 4, 24
 

@@ -18,7 +18,7 @@ from scene_texts import GOOD
 from disco_twin.evaluate.scores import load_relit, load_scores
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.pipeline_process import load_results, pipeline_inputs, stale
-from disco_twin.experiment.run_folder import RunFolder, write_atomically
+from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.light.references import load_reference
 from disco_twin.light.truth import Truth
 from disco_twin.object.mesh import read_mesh
@@ -28,6 +28,7 @@ from disco_twin.run.simulate import render_references, require_capturable
 from disco_twin.scene.scene import Scene, load_scene
 from hw.base.config import read_json
 from hw.base.errors import InputError, naming, refused_by_the_disk
+from hw.base.files import write_atomically
 from pipeline.geometry.distortion import covers_image
 from pipeline.geometry.nominal_rig import CameraConfig
 from pipeline.records import MethodFigures, PipelineRecord, RigFile

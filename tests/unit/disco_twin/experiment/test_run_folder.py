@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from disco_twin.experiment.run_folder import RunFolder, content_key, write_atomically
+from disco_twin.experiment.run_folder import RunFolder, content_key
 from hw.base.errors import InputError
+from hw.base.files import write_atomically
 from hw.base.resources import measured, usable_cores
 
 

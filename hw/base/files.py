@@ -1,0 +1,101 @@
+"""The file layer: files are replaced as a whole, carry `format_version`, and are worked on by one process at a time."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hw.base.errors import InputError
+
+Arrays = dict[str, NDArray[Any]]
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[IO[bytes]]:
+    """A new file that takes the place of `path` when the block ends: a reader, or a run after a crash, sees the old
+    content or the new.
+
+    Raises: OSError where the disk refuses; it names `path`, and nothing is left of what was not written in full.
+    """
+    fresh = path.with_name(path.name + ".part")
+    try:
+        with fresh.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        fresh.replace(path)
+    except OSError as error:
+        fresh.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    except BaseException:
+        fresh.unlink(missing_ok=True)
+        raise
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file as a whole (see `replacing`)."""
+    with replacing(path) as file:
+        file.write(content)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Replace a JSON file as a whole. Raises: ValueError for a NaN, which no other reader would accept."""
+    write_atomically(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+
+
+def save_arrays(path: Path, version: int, arrays: Mapping[str, NDArray[Any]], **head: Any) -> None:
+    """Replace an .npz as a whole: arrays, and a head of whatever JSON holds, with `format_version`. No pickle."""
+    with replacing(path) as file:
+        np.savez(file, head=np.array(json.dumps({"format_version": version} | head)), **arrays)
+
+
+def load_arrays(
+    path: Path, version: int, remedy: str, names: Collection[str] | None = None
+) -> tuple[dict[str, Any], Arrays]:
+    """Head and arrays (all of them, or those of `names`) that `save_arrays` wrote.
+
+    Raises: InputError for a file that is missing, damaged, or of another format version.
+    """
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+            head = json.loads(str(data["head"])) if "head" in data else {"format_version": _older(data)}
+            require_version(path, head.get("format_version"), version, remedy)
+            return head, {name: data[name] for name in (data.files if names is None else names) if name != "head"}
+    except FileNotFoundError as error:
+        raise InputError("is missing", file=path, remedy=remedy) from error
+    except (OSError, zipfile.BadZipFile, zlib.error, ValueError, EOFError, TypeError, AttributeError) as error:
+        raise InputError("is damaged, or another kind of file", file=path, remedy=remedy) from error
+    except KeyError as error:
+        raise InputError(f"is damaged (it lacks {error})", file=path, remedy=remedy) from error
+
+
+def _older(data: Mapping[str, NDArray[Any]]) -> int | None:
+    """The version of a file from before heads."""
+    return int(data["format_version"]) if "format_version" in data else None
+
+
+def require_version(path: Path, found: Any, version: int, remedy: str) -> None:
+    """Refuse a file of another format version. Raises: InputError."""
+    if found != version:
+        raise InputError(
+            "another format", file=path, key="format_version", value=found, allowed=str(version), remedy=remedy
+        )
+
+
+def take_lock(handle: int) -> bool:
+    """Lock an open file or folder until it is closed; False where another process holds it. POSIX only."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
