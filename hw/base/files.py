@@ -56,7 +56,8 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 def save_arrays(path: Path, version: int, arrays: Mapping[str, NDArray[Any]], **head: Any) -> None:
     """Replace an .npz as a whole: arrays, and a head of whatever JSON holds, with `format_version`. No pickle."""
     with replacing(path) as file:
-        np.savez(file, head=np.array(json.dumps({"format_version": version} | head)), **arrays)
+        everything = {"head": np.array(json.dumps({"format_version": version} | head)), **arrays}
+        np.savez(file, **everything)  # type: ignore[arg-type]  # the stubs fear an array named allow_pickle
 
 
 def load_arrays(

@@ -16,8 +16,7 @@ from hw.base.files import load_arrays, replacing, save_arrays, take_lock, write_
 def test_a_failure_leaves_the_old_content_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "file"
     write_atomically(path, b"old")
-    with pytest.raises(KeyboardInterrupt), replacing(path) as file:
-        file.write(b"half of the n")
+    with pytest.raises(KeyboardInterrupt), replacing(path):
         raise KeyboardInterrupt
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
@@ -77,9 +76,9 @@ def test_a_flipped_bit_is_no_traceback(tmp_path: Path, byte: int) -> None:
 def test_other_versions_and_lacking_arrays_are_named(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     save_arrays(path, 2, {"values": np.zeros(1)})
-    with pytest.raises(InputError, match="another format.*format_version.*3"):
+    with pytest.raises(InputError, match=r"format_version = 2: another format.*3"):
         load_arrays(path, 3, "make it again")
-    with pytest.raises(InputError, match="lacks.*weights"):
+    with pytest.raises(InputError, match=r"lacks.*weights"):
         load_arrays(path, 2, "make it again", ["weights"])
     np.savez(path, format_version=1, values=np.zeros(1))  # from before heads
     with pytest.raises(InputError, match="another format"):
