@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from disco_twin.report.page import rms
+from disco_twin.evaluate.summary import rms
 from disco_twin.run.stages import open_run, run_all
 
 SCENE = Path(__file__).resolve().parents[1] / "scenes" / "quick.toml"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from disco_twin.evaluate.simulation_noise import measured_noise
 from disco_twin.experiment.run_folder import RunFolder
@@ -71,3 +73,20 @@ def load_summary(path: Path) -> dict[str, Any]:
             allowed=str(FORMAT_VERSION), remedy="disco-twin score writes it anew",
         )  # fmt: skip
     return data
+
+
+def rms(values: Sequence[float]) -> float:
+    """Root mean square that keeps the sign of each value's square (nrmse may be negative within its noise)."""
+    square = float(np.mean([v * abs(v) for v in values])) if values else float("nan")
+    return float(np.copysign(abs(square) ** 0.5, square))
+
+
+def pooled(relit: Sequence[Mapping[str, Any]], method: str, light: str | None = None) -> float:
+    """rms of a method's nrmse over the views, and over the lights unless one is given; NaN where there is no score."""
+    rows = [r for r in relit if r["method"] == method and light in (None, r["light"])]
+    return rms([float(r["nrmse"]) for r in rows if r["nrmse"] is not None])
+
+
+def figure_or_dash(value: float | None) -> str:
+    """Three digits, or a dash where there is no score."""
+    return "-" if value is None or not np.isfinite(value) else f"{value:.3f}"

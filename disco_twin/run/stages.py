@@ -271,7 +271,7 @@ def print_scores(summary: dict[str, Any], methods: Sequence[str], console: Conso
     """A table of nrmse by light and method."""
     from rich.table import Table
 
-    from disco_twin.report.page import figure_or_dash, pooled
+    from disco_twin.evaluate.summary import figure_or_dash, pooled
 
     relit = summary["relit"]
     table = Table(box=None, pad_edge=False, header_style="dim")
@@ -288,7 +288,7 @@ def print_budget(rows: Sequence[dict[str, Any]], console: Console) -> None:
     """A table of nrmse by light and calibration."""
     from rich.table import Table
 
-    from disco_twin.report.page import figure_or_dash, rms
+    from disco_twin.evaluate.summary import figure_or_dash, rms
 
     table = Table(box=None, pad_edge=False, header_style="dim")
     table.add_column("nrmse, calibration")

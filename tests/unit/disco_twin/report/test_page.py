@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from report_fakes import LIGHTS, fake_data
 
-from disco_twin.report.calibration import section
-from disco_twin.report.page import ReportData, render, rms, write_report
+from disco_twin.evaluate.summary import rms
+from disco_twin.report.page import ReportData, render, write_report
 
 
 def test_the_page_is_self_contained_and_complete(tmp_path: Path) -> None:
@@ -50,7 +52,7 @@ def test_rms_keeps_the_sign_of_the_square() -> None:
     assert rms([0.1, -0.1]) == pytest.approx(0.0)
 
 
-MEASURED = {
+MEASURED: dict[str, Any] = {
     "source": "measured",
     "lenses": [
         {
@@ -105,30 +107,64 @@ MEASURED = {
 }
 
 
-def test_the_calibration_is_told_with_its_uncertainty() -> None:
-    """Of a measured one every part; of another one why there is nothing to tell. One angle has no axis."""
-    text, body = section(MEASURED, [635.0])
-    assert "standard deviation" in text
-    for shown in (
-        "1405.4 +- 2.7 px (0.19%)",
-        "0.9915 +- 0.0031",
-        "known to 0.17%",
-        "drifted by 35%",
-        "+- 0.43 mm across, +- 0.86 mm along the axis, +- 0.087 deg",
-        "tilt -0.011 +- 0.015, 0.013 +- 0.012 deg",
+def calibration_section(found: dict[str, Any]) -> str:
+    """The calibration's section of a page that shows little else."""
+    summary = {**fake_data().summary, "relit": [], "calibration": found}
+    page = render(ReportData(summary=summary, wavelengths_nm=[635.0], main="default"))
+    return page.split("<h2>Calibration</h2>")[1].split("</section>")[0]
+
+
+def test_a_measured_calibration_is_shown_with_its_uncertainty() -> None:
+    shown = calibration_section(MEASURED)
+    for text in (
+        "standard deviation",
+        "1405.4 ± 2.7 px (0.19 %)",
+        "0.9915 ± 0.0031",
+        "known to 0.17 %",
+        "24.0 % of the full well",
+        "8.93 mW",
+        "drifted by 35 %",
+        "± 0.43 mm across, ± 0.86 mm along the axis, ± 0.087°",
+        "tilt -0.011 ± 0.015, 0.013 ± 0.012°",
+        "between 16 and 30 pixels",
         "0.065 mm, alike over 10 mm",
         "rotation about &lt;z&gt;",
         "86 used, 91 hidden, 3 false",
-        "+- 0.033 mm",
-        "0.089 +- 0.033 mm sin(t) + 0.102 +- 0.036 mm sin(t)^3",
+        "± 0.033 mm",
+        "0.089 ± 0.033 mm sin(t) + 0.102 ± 0.036 mm sin(t)³",
     ):
-        assert shown in body
-    assert "axis</td><td class='text'>tilt" not in section(MEASURED | {"axis": None}, [635.0])[1]
-    untold = MEASURED | {"silhouettes": MEASURED["silhouettes"] | {"scan_error_mm": 0.0, "scan_error_alike_mm": 0.0}}
-    assert "own error</td><td class='text'>not known" in section(untold, [635.0])[1]
-    earlier = {
-        k: v for k, v in MEASURED["silhouettes"].items() if k != "scan_error_alike_mm"
-    }  # a run made before it was
-    assert "own error</td><td class='text'>not known" in section(MEASURED | {"silhouettes": earlier}, [635.0])[1]
-    assert section({"source": "nominal"}, [635.0])[1] == ""
-    assert "given as a file" in section({"source": "given"}, [635.0])[0]
+        assert text in shown
+
+
+def test_the_calibration_shows_only_what_was_found() -> None:
+    """One angle has no axis; a linear camera no response; runs of earlier versions no length of the scan's error."""
+    assert "turntable" not in calibration_section(MEASURED | {"axis": None})
+    assert "response" not in calibration_section(MEASURED | {"response": None})
+    outline = dict(MEASURED["silhouettes"])
+    for unknown in (outline | {"scan_error_alike_mm": 0.0}, {k: outline[k] for k in outline if "alike" not in k}):
+        assert "own error</td><td>not known" in calibration_section(MEASURED | {"silhouettes": unknown})
+    for source, reason in (("nominal", "deviation is off"), ("given", "given as a file"), ("other", "No figures")):
+        shown = calibration_section({"source": source})
+        assert reason in shown
+        assert "<table" not in shown
+
+
+HOSTILE = """<script>alert("1")</script>'ü"""
+ESCAPED = "&lt;script&gt;alert(&#34;1&#34;)&lt;/script&gt;&#39;ü"
+
+
+def test_text_from_files_is_escaped_wherever_it_stands() -> None:
+    """Names of scene, light, view, method, camera; notes and reasons: as text, in attributes too."""
+    data = fake_data()
+    rows = [{**row, "light": HOSTILE, "view": HOSTILE, "method": HOSTILE} for row in data.summary["relit"][:1]]
+    lens = MEASURED["lenses"][0] | {"camera": HOSTILE}
+    omission = {"what": HOSTILE, "because": HOSTILE}
+    found = MEASURED | {"lenses": [lens]}
+    summary = {**data.summary, "scene": HOSTILE, "relit": rows, "calibration": found, "left_out": [omission]}
+    comparison = replace(data.comparisons[0], light=HOSTILE, relit={HOSTILE: data.comparisons[0].relit["default"]})
+    data = replace(data, wavelengths_nm=[635.0], summary=summary, main=HOSTILE, comparisons=[comparison])
+    page = render(replace(data, notes=[HOSTILE], decades={}, truth=None, balance={}))
+    assert "<script" not in page
+    assert f'alt="{ESCAPED}"' in page
+    places = {"head": 4, "relit": 2, "errors": 6, "calibration": 2, "left out": 2}
+    assert page.count(ESCAPED) == sum(places.values())
