@@ -138,8 +138,9 @@ def reconstruct(out: RunOut, methods: MethodsOption = None) -> None:
 def reference(scene: SceneFile, out: RunOut, profile: ProfileOption = "full") -> None:
     """Render the reference images of a scene into DIR, one EXR per light and held-out view."""
     from disco_twin.experiment.experiment import Experiment
+    from disco_twin.experiment.references import render_references, shipped_references
     from disco_twin.run.progress import stage_bar
-    from disco_twin.run.simulate import render_references, require_capturable, shipped_references
+    from disco_twin.run.simulate import require_capturable
     from disco_twin.scene.scene import load_scene
 
     loaded = load_scene(scene, profile)
@@ -169,8 +170,9 @@ def score(out: RunOut, methods: MethodsOption = None, budget: BudgetOption = Fal
 def plan(scene: SceneFile, profile: ProfileOption = "full") -> None:
     """Predict images, bytes and time of a scene, and say what it leaves out. Needs no renderer."""
     from disco_twin.experiment.experiment import Experiment
+    from disco_twin.experiment.references import shipped_references
     from disco_twin.run.cost_prediction import predict
-    from disco_twin.run.simulate import require_capturable, shipped_references
+    from disco_twin.run.simulate import require_capturable
     from disco_twin.scene.scene import load_scene
 
     with naming(scene):

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_twin.experiment.experiment import Experiment
+from disco_twin.experiment.references import reference_path
 from disco_twin.experiment.run_folder import RunFolder
-from disco_twin.run.simulate import reference_path
 from hw.base.config import Strict, read_json
 from hw.base.errors import InputError
 from hw.base.files import write_json

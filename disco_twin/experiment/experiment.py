@@ -15,7 +15,6 @@ from disco_twin.experiment.run_folder import content_key
 from disco_twin.scene.scene import Scene
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.nominal_rig import CameraConfig
-from pipeline.relight.lights import Light
 
 if TYPE_CHECKING:
     import trimesh
@@ -99,13 +98,7 @@ class Experiment:
 def identity(scene: Scene) -> str:
     """Key of all that a capture and its ground truth depend on; how they are used may change within a run folder."""
     parts = scene.model_dump(include={"format_version", "name", "seed", "object", "scan", "rig", "simulation"})
-    return content_key(_plain(parts))
-
-
-def reference_key(scene: Scene, light: Light, view: CameraConfig) -> str:
-    """Key of a reference image: object, wavelengths, light and view. More walks make it better, not another one."""
-    lasers = [laser.wavelength_nm for laser in scene.rig.lasers]
-    return content_key(_plain(scene.object.model_dump()), lasers, _plain(light.model_dump()), _plain(view.model_dump()))
+    return content_key(plain(parts))
 
 
 def mm_per_pixel(camera: CameraConfig) -> float:
@@ -114,14 +107,14 @@ def mm_per_pixel(camera: CameraConfig) -> float:
     return distance * camera.pixel_pitch_um * 1e-3 / camera.focal_length_mm
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """JSON's types; a file becomes the key of its content."""
     if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
+        return {k: plain(v) for k, v in value.items()}
     if isinstance(value, Path):
         return content_key(value)
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     return value
 
 

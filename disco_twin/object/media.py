@@ -14,8 +14,8 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from disco_twin.object.features import coverage
-from disco_twin.object.materials import measured
 from disco_twin.object.voxels import read_voxels
+from disco_twin.scene.materials import measured
 from disco_twin.scene.object_schema import Grid, HollowCore, Homogeneous, MediumConfig
 from hw.base.errors import InputError
 

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from disco_twin.evaluate.scores import load_model, load_relit, load_scores
 from disco_twin.experiment.experiment import Experiment, mm_per_pixel
 from disco_twin.experiment.pipeline_process import load_results
+from disco_twin.experiment.references import reference_path
 from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.report.figures import Comparison, Impulse
 from disco_twin.report.page import ReportData
-from disco_twin.run.simulate import reference_path
 from hw.record import Sensor
 from pipeline.calibrate.calibration import Calibration
 from pipeline.geometry.nominal_rig import RigConfig

@@ -1,35 +1,28 @@
-"""The twin's stages of a run: scan, capture, ground truth, references. Each writes its files into the run folder."""
+"""The twin's stages of a run: scan, capture, ground truth. Each writes its files into the run folder."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from disco_twin.experiment.experiment import Experiment, reference_key
+from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.run_folder import RunFolder
 from hw.base.errors import InputError
 from hw.base.files import write_atomically
-from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.nominal_rig import CameraConfig, FaultsConfig
 from pipeline.plan.visibility import require_in_sight
 from pipeline.records import RigFile, SensorFile
-from pipeline.relight.lights import Light
 
 if TYPE_CHECKING:
     from disco_twin.emulation.twin_rig import TwinRig
     from disco_twin.light.truth import Truth
     from hw.record import Sensor
-    from pipeline.capture.loop import CaptureReport
+    from pipeline.capture.loop import CaptureReport, Progress
 
-log = logging.getLogger(__name__)
-
-Progress = Callable[[int, int], None]  # done, total
 COLUMNS_AT_ONCE = 4  # columns of truth between two words on the progress
 
 
@@ -150,76 +143,3 @@ def joined(parts: Sequence[Truth]) -> Truth:
         parts[0].area,
         EnergyBalance(**mean),
     )
-
-
-def reference_path(folder: Path, light: Light, view: CameraConfig) -> Path:
-    """Where the reference of a light and view lies in a folder of references."""
-    return folder / f"{light.name}@{view.name}.exr"
-
-
-def shipped_references(scene_file: Path, name: str) -> Path:
-    """References that are committed beside a shipped scene."""
-    return scene_file.parent / "references" / name
-
-
-def holds_reference(folder: Path, experiment: Experiment, light: Light, view: CameraConfig) -> bool:
-    """Whether a folder holds this scene's reference of a light and view, with walks enough."""
-    from disco_twin.light.references import load_reference
-
-    path = reference_path(folder, light, view)
-    if not path.is_file():
-        return False
-    try:
-        found = load_reference(path)
-    except InputError as error:
-        log.warning("%s", error)
-        return False
-    walks = experiment.scene.simulation.reference_walks
-    return found.key == reference_key(experiment.scene, light, view) and found.walks >= walks // 2
-
-
-def render_references(experiment: Experiment, shipped: Path, own: Path, progress: Progress) -> int:
-    """Make sure that every reference lies in `own`: taken from `shipped`, kept from before, or rendered now.
-
-    Returns how many lights had to be rendered.
-    """
-    from disco_twin.light.references import save_reference
-
-    scene, rendered = experiment.scene, 0
-    lights = scene.relight.lights
-    if own.exists() and not own.is_dir():
-        raise InputError("is not a folder", file=own, remedy="choose another --out")
-    own.mkdir(parents=True, exist_ok=True)
-
-    for done, light in enumerate(lights):
-        progress(done, len(lights))
-        missing = []
-        for view in scene.relight.views:
-            name = reference_path(own, light, view)
-            if holds_reference(own, experiment, light, view):
-                continue
-            if holds_reference(shipped, experiment, light, view):
-                write_atomically(name, reference_path(shipped, light, view).read_bytes())
-            else:
-                missing.append(view)
-        for size in sorted({(v.width, v.height) for v in missing}):
-            views = [v for v in missing if (v.width, v.height) == size]
-            _render(experiment, light, views, own, save_reference)
-        rendered += bool(missing)
-    progress(len(lights), len(lights))
-    return rendered
-
-
-def _render(
-    experiment: Experiment, light: Light, views: Sequence[CameraConfig], own: Path, save: Callable[..., None]
-) -> None:
-    transport = experiment.transport
-    from disco_twin.light.references import render_reference
-
-    cameras = [PinholeCamera.from_config(v) for v in views]
-    walks, seed = experiment.scene.simulation.reference_walks, experiment.seed(f"reference {light.name}")
-    for view, image in zip(views, render_reference(transport, light, cameras, walks, seed), strict=True):
-        path = reference_path(own, light, view)
-        partial = path.with_name(f"part-{path.name}")
-        save(partial, replace(image, key=reference_key(experiment.scene, light, view)))
-        partial.replace(path)

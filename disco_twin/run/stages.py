@@ -46,7 +46,8 @@ LIGHT_CODE = (  # what the simulated light and the images of it come from
             "camera",
             "faults",
             "emulation.twin_rig",
-            "experiment.experiment",
+            "experiment",
+            "scene.materials",
             "run.simulate",
         )
     ),
@@ -180,7 +181,7 @@ def capture_stages(run: Run) -> None:
 
 def truth_stages(run: Run) -> None:
     """Ground-truth R_d and the reference images."""
-    from disco_twin.experiment.experiment import reference_key
+    from disco_twin.experiment.references import reference_key, render_references, shipped_references
     from disco_twin.run import simulate
 
     scene, folder, key = run.scene, run.folder, light_key(run)
@@ -192,11 +193,11 @@ def truth_stages(run: Run) -> None:
         "columns",
     )
     keys = [reference_key(scene, light, view) for light in scene.relight.lights for view in scene.relight.views]
-    shipped = simulate.shipped_references(run.scene_file, scene.name)
+    shipped = shipped_references(run.scene_file, scene.name)
     run.stage(
         "references",
         content_key(key, keys, scene.simulation.reference_walks),
-        lambda report: simulate.render_references(run.experiment, shipped, folder.twin / "references", report),
+        lambda report: render_references(run.experiment, shipped, folder.twin / "references", report),
         "lights",
     )
 

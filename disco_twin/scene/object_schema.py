@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from disco_twin.object.materials import MATERIALS
+from disco_twin.scene.materials import MATERIALS
 from hw.base.config import NearbyFile, Strict
 from pipeline.geometry.nominal_rig import Point, Positive
 

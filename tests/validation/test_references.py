@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 from tests.validation.significance import assert_z
 
-from disco_twin.experiment.experiment import reference_key
+from disco_twin.experiment.references import reference_key, reference_path
 from disco_twin.light.references import load_reference, render_reference
 from disco_twin.light.transport import Transport
 from disco_twin.object.build import build_object
-from disco_twin.run.simulate import reference_path
 from disco_twin.scene.scene import load_scene
 from pipeline.geometry.camera import PinholeCamera
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from disco_twin.experiment.experiment import Experiment
+from disco_twin.experiment.references import shipped_references
 from disco_twin.run.cost_prediction import predict, simulation_seconds
-from disco_twin.run.simulate import shipped_references
 from disco_twin.scene.scene import load_scene
 
 SCENE = Path(__file__).parents[4] / "scenes" / "quick.toml"
