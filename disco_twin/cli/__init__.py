@@ -1,1 +1,1 @@
-"""The command line."""
+"""The command line: what a user types, and the errors that it answers with."""

@@ -1,1 +1,1 @@
-"""report.html: one self-contained page with figures."""
+"""The report of a run, report.html: one self-contained page with figures."""
