@@ -27,6 +27,7 @@ from disco_twin.camera.targets import TargetSource
 from disco_twin.faults.actual_rig import actual_rig
 from disco_twin.object.shapes import pebble
 from disco_twin.scene.object_schema import Pebble
+from disco_twin.scene.rig_schema import FaultsConfig, TwinRigConfig
 from hw.record import to_radiance
 from pipeline.calibrate import pose as pose_module
 from pipeline.calibrate.intrinsics import find_corners, fit_intrinsics
@@ -34,7 +35,7 @@ from pipeline.calibrate.outline import mesh_mask, object_mask
 from pipeline.calibrate.projector_fit import projection, refine
 from pipeline.calibrate.response import TABLE, fit_response
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.geometry.nominal_rig import CameraConfig, FaultsConfig, ProjectorConfig, RigConfig
+from pipeline.geometry.nominal_rig import CameraConfig, ProjectorConfig
 from pipeline.geometry.projector import TwoMirrorProjector
 from pipeline.plan.targets import make_bracket, make_targets
 
@@ -42,7 +43,7 @@ F64 = NDArray[np.float64]
 SEED = 5
 
 
-def rig_config() -> RigConfig:
+def rig_config() -> TwinRigConfig:
     """The rig of the quick scene, one camera, one turntable angle, off its nominal place."""
     camera = CameraConfig(
         name="front",
@@ -53,7 +54,7 @@ def rig_config() -> RigConfig:
         pixel_pitch_um=44.0,
     )
     projector = ProjectorConfig(position_mm=(590.0, 60.0, 110.0), full_angle_deg=6.0)
-    return RigConfig(cameras=(camera,), projector=projector, faults=FaultsConfig(deviation=True))
+    return TwinRigConfig(cameras=(camera,), projector=projector, faults=FaultsConfig(deviation=True))
 
 
 def timed(work: Callable[[], Any], repetitions: int) -> tuple[Any, dict[str, float]]:
@@ -70,7 +71,7 @@ def timed(work: Callable[[], Any], repetitions: int) -> tuple[Any, dict[str, flo
     }
 
 
-def intrinsics(rig: RigConfig, counts: Sequence[int], repetitions: int) -> list[dict[str, Any]]:
+def intrinsics(rig: TwinRigConfig, counts: Sequence[int], repetitions: int) -> list[dict[str, Any]]:
     """Error: of the focal length, as a share."""
     actual, sensor = actual_rig(rig, SEED), lars3_sensor(rig)
     targets, _ = make_targets(rig, 0)
@@ -94,7 +95,7 @@ def intrinsics(rig: RigConfig, counts: Sequence[int], repetitions: int) -> list[
 
 
 def responses(
-    rig: RigConfig, strides: Sequence[int], repetitions: int
+    rig: TwinRigConfig, strides: Sequence[int], repetitions: int
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Error: of the exposure that a digital number stands for, as a share, rms from a fiftieth of the range on.
 
@@ -138,7 +139,7 @@ def silhouette(mesh: trimesh.Trimesh, camera: PinholeCamera) -> NDArray[np.float
 
 
 def poses(
-    rig: RigConfig, mesh: trimesh.Trimesh, steps: Sequence[int], xor: Sequence[int], repetitions: int
+    rig: TwinRigConfig, mesh: trimesh.Trimesh, steps: Sequence[int], xor: Sequence[int], repetitions: int
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Errors in mm: of the object's vertices before the camera, root mean square, from 5 mm and 5 degrees off."""
     actual, sensor = actual_rig(rig, SEED), lars3_sensor(rig)
@@ -191,7 +192,9 @@ def xor_search(
     return moved(best.x)
 
 
-def projectors(rig: RigConfig, mesh: trimesh.Trimesh, counts: Sequence[int], repetitions: int) -> list[dict[str, Any]]:
+def projectors(
+    rig: TwinRigConfig, mesh: trimesh.Trimesh, counts: Sequence[int], repetitions: int
+) -> list[dict[str, Any]]:
     """Error in mm of predicted spots on the surface, root mean square; every fifth spot is false."""
     actual, rng = actual_rig(rig, SEED).projector, np.random.default_rng(SEED)
     nominal, points = TwoMirrorProjector.from_config(rig.projector), []

@@ -30,11 +30,12 @@ from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.emulation.emulated_rig import Emulation
 from disco_twin.emulation.twin_rig import TwinRig
 from disco_twin.firmware import wire
+from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.clock import VirtualClock
 from hw.base.errors import DiscoError
 from hw.interface import Aim
 from pipeline.capture.loop import capture
-from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
+from pipeline.geometry.nominal_rig import CameraConfig
 from pipeline.plan.plan import Plan
 from pipeline.stream.stream import CorruptImage, StreamReader
 
@@ -43,7 +44,7 @@ SIZE = (31, 48)
 ATTEMPTS = 6  # a command that is repeated more often than this, after one fault, has hung
 PATIENCE = 10.0  # of the undisturbed capture's (virtual) time
 
-RIG = RigConfig(
+RIG = TwinRigConfig(
     cameras=tuple(
         CameraConfig(name=name, position_mm=(x, 60, 100), width=SIZE[1], height=SIZE[0], focal_length_mm=10)
         for name, x in (("front", 450), ("back", -450))

@@ -55,14 +55,14 @@ def capture_frames(folder: Path, spots: int, walks: int, angles: int = 3, vertic
     from disco_twin.emulation.twin_rig import TwinRig
     from disco_twin.experiment.experiment import Experiment
     from disco_twin.faults.actual_rig import actual_rig
+    from disco_twin.scene.rig_schema import TwinRigConfig
     from disco_twin.scene.scene import load_scene
     from pipeline.capture.loop import capture
-    from pipeline.geometry.nominal_rig import RigConfig
 
     scene = load_scene(SCENE, faults=False)
     lit = {"warm_up": True, "blue_noise": True, "mode_hop": True, "speckle": True, "flare": True}
 
-    def rig(factor: int) -> RigConfig:
+    def rig(factor: int) -> TwinRigConfig:
         size = {"width": WIDTH // factor, "height": HEIGHT // factor, "pixel_pitch_um": 11.0 * factor}
         cameras = tuple(camera.model_copy(update=size) for camera in scene.rig.cameras)
         faults = scene.rig.faults.model_copy(update=lit)

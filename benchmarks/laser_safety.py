@@ -35,6 +35,7 @@ from disco_twin.emulation.rig_rules import load_rig_file
 from disco_twin.emulation.selftest import rig_file_of
 from disco_twin.emulation.serve import Server
 from disco_twin.emulation.served_rig import emulated_devices
+from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.clock import WallClock
 from hw.devices.omicron_protocol import Mode
 from hw.interface import Aim
@@ -42,7 +43,7 @@ from hw.record import RawImage
 from hw.rig.serial_rig import SerialRig
 from hw.serial.link import Link
 from pipeline.capture.loop import capture
-from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
+from pipeline.geometry.nominal_rig import CameraConfig
 from pipeline.plan.plan import Plan
 
 SEED = 635532476
@@ -54,7 +55,7 @@ CLOSING_S = 0.1  # within it comes the signal after a normal end; closing the ri
 SIGNALS = {name: signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGKILL")}
 EVENTS = ("connect", "exit", "exception", "closing", *SIGNALS)
 EACH = 23  # trials
-RIG = RigConfig(cameras=(CameraConfig(name="front", position_mm=(450, 60, 100), width=16, height=16),))
+RIG = TwinRigConfig(cameras=(CameraConfig(name="front", position_mm=(450, 60, 100), width=16, height=16),))
 PLAN = Plan(("front",), (0.0,), tuple(Aim(0, 1800 + k, 2000) for k in range(400)), lasers=3)
 
 

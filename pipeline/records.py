@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 
 from hw.base.config import Strict, as_table
 from hw.record import Sensor
@@ -16,6 +16,13 @@ class RigFile(Strict):
 
     format_version: Literal[1]
     rig: RigConfig
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_faults(cls, data: Any) -> Any:
+        """Captures of before held a table `faults` in the rig, which was of no use to the pipeline."""
+        rig = data.get("rig") if isinstance(data, dict) else None
+        return data | {"rig": {k: v for k, v in rig.items() if k != "faults"}} if isinstance(rig, dict) else data
 
 
 class SensorFile(Strict):

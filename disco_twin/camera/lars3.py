@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from disco_twin.camera import sensor as steps
 from disco_twin.camera.lens import Glare, vignetting
+from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.record import RawImage, Sensor
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.nominal_rig import RigConfig
@@ -79,7 +80,7 @@ class Lars3:
     curved: bool = False
 
     @classmethod
-    def of(cls, rig: RigConfig, camera: PinholeCamera) -> Lars3:
+    def of(cls, rig: TwinRigConfig, camera: PinholeCamera) -> Lars3:
         """The twin's camera behind the lens of `camera`."""
         glare = Glare.of(camera.height, camera.width) if rig.faults.flare else None
         return cls(lars3_sensor(rig), vignetting(camera), glare, rig.sensor.response == "curved")

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from disco_twin.emulation.selftest import rig_file_of
 from disco_twin.experiment.run_folder import require_folder
+from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.clock import WallClock
 from hw.base.errors import DiscoError, InputError
 from hw.base.files import take_lock, write_atomically
 from hw.interface import Aim
-from pipeline.geometry.nominal_rig import RigConfig
 
 if TYPE_CHECKING:
     from disco_twin.emulation.emulated_rig import Emulation
@@ -40,7 +40,7 @@ class Darkness:
         raise DiscoError("these emulated devices have no camera")
 
 
-def emulated_devices(scene: RigConfig, seed: int) -> Emulation:
+def emulated_devices(scene: TwinRigConfig, seed: int) -> Emulation:
     """The devices of a scene in real time, for cameras elsewhere: the photodiode reads what falls on it now."""
     from disco_twin.emulation.emulated_rig import Emulation
     from disco_twin.emulation.twin_rig import TwinRig, watts_per_count
@@ -59,7 +59,7 @@ def emulated_devices(scene: RigConfig, seed: int) -> Emulation:
 
 
 @contextmanager
-def served(scene: RigConfig, seed: int, folder: Path) -> Iterator[Path]:
+def served(scene: TwinRigConfig, seed: int, folder: Path) -> Iterator[Path]:
     """Emulated devices on pseudo-terminals in a folder, and the rig file that reaches them."""
     from disco_twin.emulation.serve import Server
 

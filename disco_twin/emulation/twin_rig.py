@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from disco_twin.camera.lars3 import Lars3
 from disco_twin.faults.actual_rig import ActualRig, actual_rig
 from disco_twin.faults.light_faults import LaserPower, Stream, generator, speckle
+from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.errors import DiscoError, InputError, Refused
 from hw.devices.mm_ard import ADC_TOP
 from hw.interface import Aim, Camera, Floodlight, Laser, LaserReading, Photodiode, Projector, Turntable
 from hw.record import RawImage
-from pipeline.geometry.nominal_rig import LaserConfig, RigConfig
+from pipeline.geometry.nominal_rig import LaserConfig
 
 F32 = NDArray[np.float32]
 
@@ -70,7 +71,9 @@ def watts_per_count(laser: LaserConfig) -> float:
 class TwinRig:
     """`hw.interface.Rig` without hardware: nominal `config`, light from `source`, everything random from `seed`."""
 
-    def __init__(self, config: RigConfig, source: ResponseSource, seed: int, actual: ActualRig | None = None) -> None:
+    def __init__(
+        self, config: TwinRigConfig, source: ResponseSource, seed: int, actual: ActualRig | None = None
+    ) -> None:
         actual = actual_rig(config, seed) if actual is None else actual
         self.config, self.source, self.seed, self.actual = config, source, seed, actual
         self.power: Power = LaserPower(config.lasers, config.faults, seed)
@@ -234,7 +237,7 @@ class TargetRig(TwinRig):
     """One camera of the twin, with targets in the object's place: the "turntable" is a person who exchanges them."""
 
     def __init__(
-        self, config: RigConfig, source: ResponseSource, seed: int, actual: ActualRig, camera: int, placements: int
+        self, config: TwinRigConfig, source: ResponseSource, seed: int, actual: ActualRig, camera: int, placements: int
     ) -> None:
         only = slice(camera, camera + 1)
         config = config.model_copy(update={"cameras": config.cameras[only]})

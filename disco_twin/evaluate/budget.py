@@ -22,10 +22,10 @@ from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.pipeline_process import reconstruct_apart
 from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.faults.actual_rig import ActualRig, actual_rig
+from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.errors import InputError
 from hw.base.files import write_json
 from pipeline.calibrate.calibration import Calibration, ProjectorCalibration, nominal_calibration, pair, pose_rows
-from pipeline.geometry.nominal_rig import RigConfig
 
 FORMAT_VERSION = 1
 RECORD = "budget.json"
@@ -48,7 +48,7 @@ class VariantFolder(RunFolder):
         return self.base.twin
 
 
-def true_calibration(rig: RigConfig, actual: ActualRig, nominal: Calibration) -> Calibration:
+def true_calibration(rig: TwinRigConfig, actual: ActualRig, nominal: Calibration) -> Calibration:
     """The calibration that a measurement without error would give. Each mirror move's own error stays out of reach.
 
     A lens that throws light outside the image is a little darker: all images lose the same share.

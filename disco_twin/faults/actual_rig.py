@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from disco_twin.faults.light_faults import Stream, generator
+from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.interface import Aim
 from pipeline.geometry.camera import PinholeCamera, turn
-from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.geometry.projector import TwoMirrorProjector
 
 F64 = NDArray[np.float64]
@@ -68,7 +68,7 @@ class ActualRig:
         return origins, directions
 
 
-def actual_rig(config: RigConfig, seed: int) -> ActualRig:
+def actual_rig(config: TwinRigConfig, seed: int) -> ActualRig:
     """The rig that the light goes through. It does not depend on the order of anything but the seed."""
     cameras = tuple(PinholeCamera.from_config(c) for c in config.cameras)
     projector = TwoMirrorProjector.from_config(config.projector)

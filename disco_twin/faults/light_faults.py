@@ -13,7 +13,8 @@ import numpy as np
 from numpy.random import SFC64, Generator, SeedSequence
 from numpy.typing import NDArray
 
-from pipeline.geometry.nominal_rig import FaultsConfig, LaserConfig
+from disco_twin.scene.rig_schema import FaultsConfig
+from pipeline.geometry.nominal_rig import LaserConfig
 
 RED_FROM_NM, GREEN_FROM_NM = 590.0, 500.0
 RED_WARM_UP = (

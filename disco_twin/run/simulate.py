@@ -13,7 +13,7 @@ from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.run_folder import RunFolder
 from hw.base.errors import InputError
 from hw.base.files import write_atomically
-from pipeline.geometry.nominal_rig import CameraConfig, FaultsConfig
+from pipeline.geometry.nominal_rig import CameraConfig
 from pipeline.plan.visibility import require_in_sight
 from pipeline.records import RigFile, SensorFile
 
@@ -37,9 +37,9 @@ def write_scan(experiment: Experiment, capture: Path, sensor: Sensor | None = No
     """The nominal rig, its sensor, the scanned mesh: what the pipeline is told beside the images and their plan."""
     require_capturable(experiment)
     write_atomically(capture / "scan.ply", bytes(experiment.scan.export(file_type="ply")))
-    told = experiment.scene.rig.model_copy(update={"faults": FaultsConfig()})  # the twin's secret
+    nominal = experiment.scene.rig.nominal()
     known = SensorFile(format_version=1, sensor=sensor_of(experiment, sensor))
-    write_atomically(capture / "rig.json", RigFile(format_version=1, rig=told).model_dump_json(indent=1).encode())
+    write_atomically(capture / "rig.json", RigFile(format_version=1, rig=nominal).model_dump_json(indent=1).encode())
     write_atomically(capture / "sensor.json", known.model_dump_json(indent=1).encode())
 
 

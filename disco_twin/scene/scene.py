@@ -8,8 +8,9 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from disco_twin.scene.object_schema import ObjectConfig
+from disco_twin.scene.rig_schema import FaultsConfig, TwinRigConfig
 from hw.base.config import Strict, load_toml
-from pipeline.geometry.nominal_rig import CameraConfig, FaultsConfig, RigConfig
+from pipeline.geometry.nominal_rig import CameraConfig
 from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.relight.lights import Colour, Light, shipped_lights
 
@@ -70,7 +71,7 @@ class Scene(Strict):
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     object: ObjectConfig
     scan: ScanConfig = ScanConfig()
-    rig: RigConfig
+    rig: TwinRigConfig
     simulation: SimulationConfig = SimulationConfig()
     reconstruct: ReconstructConfig = ReconstructConfig()
     relight: RelightConfig

@@ -1,7 +1,7 @@
-"""What a rig is, nominally: lasers, projector, cameras, turntable, sweep. The schema of `[rig]` in a scene.
+"""What a rig is, nominally: lasers, projector, cameras, turntable, sweep. The schema of CAPTURE/rig.json.
 
-The pipeline is told this nominal rig and nothing else; the twin perturbs it (the actual rig) when
-`deviation = true`. Lengths in mm, angles in degrees here and radians everywhere else.
+The pipeline is given this nominal rig and nothing else; the actual rig, a real one or the twin's, departs from it.
+Lengths in mm, angles in degrees here and radians everywhere else.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class LaserConfig(Strict):
 
 
 class Aimed(Strict):
-    """A device at a place, turned towards another; `up` is up in its image (see `calibrate.camera.look_at`)."""
+    """A device at a place, turned towards another; `up` is up in its image (see `pipeline.geometry.camera.look_at`)."""
 
     position_mm: Point
     aim_mm: Point = (0.0, 0.0, 0.0)
@@ -88,18 +88,6 @@ class SensorConfig(Strict):
     response: Literal["linear", "curved"] = "linear"  # curved: digital numbers have yet to be told what they stand for
 
 
-class FaultsConfig(Strict):
-    """The rig faults of 2004; every one can be switched. They act in the twin, the pipeline must cope."""
-
-    deviation: bool = False  # the actual rig's geometry differs from the nominal one
-    warm_up: bool = False
-    blue_noise: bool = False
-    mode_hop: bool = False
-    speckle: bool = False
-    flare: bool = False
-    scanner: bool = False  # the scan is made from a cloud of points, with the scanner's errors
-
-
 class RigConfig(Strict):
     """The nominal rig. Views are all pairs of a camera and a turntable angle, cameras outermost (thesis fig. 4.1)."""
 
@@ -114,7 +102,6 @@ class RigConfig(Strict):
     turntable_angles_deg: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=72)] = (0.0,)
     spots: Annotated[int, Field(ge=1, le=200_000)] = 300  # over all turntable angles
     max_incidence_deg: Annotated[float, Field(gt=0, le=89)] = 60.0
-    faults: FaultsConfig = FaultsConfig()
 
     @model_validator(mode="after")
     def _distinct(self) -> RigConfig:

@@ -19,12 +19,12 @@ from disco_twin.experiment.experiment import Experiment
 from disco_twin.faults.actual_rig import ActualRig, actual_rig
 from disco_twin.faults.light_faults import Stream, generator
 from disco_twin.object.scanner import ERROR_MM, geometry_error
+from disco_twin.scene.rig_schema import TwinRigConfig
 from disco_twin.scene.scene import load_scene
 from hw.interface import Aim
 from hw.record import to_radiance
 from pipeline.capture.loop import capture
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.plan.plan import make_plan
 from pipeline.plan.targets import BRACKET, FOLDER, TARGETS, Targets, make_bracket, make_targets, save_targets
 
@@ -39,7 +39,7 @@ def world() -> Experiment:
     return Experiment(load_scene(QUICK, faults=False))
 
 
-def faulty_rig(width: int = 192, angles: tuple[float, ...] = (0.0, 120.0, 240.0)) -> RigConfig:
+def faulty_rig(width: int = 192, angles: tuple[float, ...] = (0.0, 120.0, 240.0)) -> TwinRigConfig:
     """The quick scene's rig with deviation and flare; 768 gives the Lars III's own resolution."""
     rig = world().scene.rig
     faults = rig.faults.model_copy(update={"deviation": True, "flare": True})
@@ -50,7 +50,7 @@ def faulty_rig(width: int = 192, angles: tuple[float, ...] = (0.0, 120.0, 240.0)
     return rig.model_copy(update={"faults": faults, "cameras": cameras, "turntable_angles_deg": angles})
 
 
-def photograph(rig: RigConfig, camera: PinholeCamera, radiance: F32, seed: int) -> F32:
+def photograph(rig: TwinRigConfig, camera: PinholeCamera, radiance: F32, seed: int) -> F32:
     """(H, W) radiance through the twin's lens and sensor, as the pipeline reads it."""
     raw = Lars3.of(rig, camera).expose(radiance, 0, generator(seed, Stream.SENSOR, 99))
     return to_radiance(raw, lars3_sensor(rig), 0).radiance
@@ -77,7 +77,7 @@ class Silhouettes:
     actual: ActualRig
 
 
-def silhouettes(seed: int, mesh: trimesh.Trimesh, rig: RigConfig | None = None) -> Silhouettes:
+def silhouettes(seed: int, mesh: trimesh.Trimesh, rig: TwinRigConfig | None = None) -> Silhouettes:
     """Every view of a seeded rig."""
     rig = rig or faulty_rig()
     actual = actual_rig(rig, seed)
@@ -90,7 +90,7 @@ def silhouettes(seed: int, mesh: trimesh.Trimesh, rig: RigConfig | None = None) 
     return Silhouettes(images, views, lenses, [float(a) for a in np.deg2rad(rig.turntable_angles_deg)], actual)
 
 
-def boards(seed: int, rig: RigConfig, camera: int) -> tuple[Targets, list[F32], PinholeCamera]:
+def boards(seed: int, rig: TwinRigConfig, camera: int) -> tuple[Targets, list[F32], PinholeCamera]:
     """Photographs of all boards by one camera of a seeded rig, and the camera as it is."""
     actual = actual_rig(rig, seed)
     targets, _ = make_targets(rig, camera)
@@ -120,7 +120,7 @@ class Glowing:
     by PATCH alike within 10 mm.
     """
 
-    def __init__(self, rig: RigConfig, actual: ActualRig, mesh: trimesh.Trimesh) -> None:
+    def __init__(self, rig: TwinRigConfig, actual: ActualRig, mesh: trimesh.Trimesh) -> None:
         self.rig, self.actual, self.mesh = rig, actual, mesh
         self.ray = RayMeshIntersector(mesh)
         self._seen: dict[tuple[int, int], tuple[F64, F64, NDArray[np.bool_]]] = {}
@@ -171,14 +171,14 @@ class Glowing:
         return np.asarray(fine.mean(axis=(1, 3)), np.float32)
 
 
-def flickering_rig() -> RigConfig:
+def flickering_rig() -> TwinRigConfig:
     """`faulty_rig` with all faults of the light."""
     rig = faulty_rig()
     on = dict.fromkeys(("warm_up", "blue_noise", "mode_hop", "speckle"), True)
     return rig.model_copy(update={"faults": rig.faults.model_copy(update=on)})
 
 
-def capture_targets(folder: Path, rig: RigConfig, seed: int, camera: int) -> tuple[Targets, TargetSource]:
+def capture_targets(folder: Path, rig: TwinRigConfig, seed: int, camera: int) -> tuple[Targets, TargetSource]:
     """A camera's boards and white plate before a seeded rig; the source knows where they really stood."""
     actual = actual_rig(rig, seed)
     targets, plan = make_targets(rig, camera)
@@ -190,7 +190,7 @@ def capture_targets(folder: Path, rig: RigConfig, seed: int, camera: int) -> tup
 
 def capture_all(
     folder: Path, seed: int, spots: int = 90, mesh: trimesh.Trimesh | None = None, curved: bool = False
-) -> RigConfig:
+) -> TwinRigConfig:
     """A whole capture of the quick scene's object by a seeded rig, calibration images included; the nominal rig."""
     rig = flickering_rig().model_copy(update={"spots": spots})
     if curved:

@@ -19,15 +19,15 @@ from disco_twin.emulation.bench import FLOOD_LINE, LAMP_LINE
 from disco_twin.emulation.emulated_rig import Emulation
 from disco_twin.emulation.selftest import rig_file_of
 from disco_twin.emulation.serve import Server
-from pipeline.geometry.nominal_rig import RigConfig
+from disco_twin.scene.rig_schema import TwinRigConfig
 
 FLOOD, LAMP, GATE = 1 << FLOOD_LINE, 1 << LAMP_LINE, 0b1
 
 
-ONE = RigConfig(cameras=(RIG.cameras[0],))
+ONE = TwinRigConfig(cameras=(RIG.cameras[0],))
 
 
-ONE_LASER = RigConfig(cameras=ONE.cameras, lasers=ONE.lasers[:1])
+ONE_LASER = TwinRigConfig(cameras=ONE.cameras, lasers=ONE.lasers[:1])
 
 
 ONE_LASERS_SCENE = (

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_twin.scene.rig_schema import FaultsConfig, TwinRigConfig
 from hw.interface import Aim
-from pipeline.geometry.nominal_rig import CameraConfig, FaultsConfig, RigConfig
+from pipeline.geometry.nominal_rig import CameraConfig
 from pipeline.plan.plan import Plan
 
 CAMERAS = tuple(
@@ -20,7 +21,7 @@ CAMERAS = tuple(
 FAULTS = FaultsConfig(deviation=True, warm_up=True, blue_noise=True, mode_hop=True, speckle=True, flare=True)
 
 
-RIG = RigConfig(cameras=CAMERAS, turntable_angles_deg=(0, 180), faults=FAULTS)
+RIG = TwinRigConfig(cameras=CAMERAS, turntable_angles_deg=(0, 180), faults=FAULTS)
 
 
 PLAN = Plan(

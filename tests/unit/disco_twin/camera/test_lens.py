@@ -7,9 +7,10 @@ import pytest
 
 from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.camera.lens import GLARE_SHARE, Glare, vignetting
+from disco_twin.scene.rig_schema import TwinRigConfig
 from pipeline.calibrate.calibration import nominal_calibration
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
+from pipeline.geometry.nominal_rig import CameraConfig
 
 
 def test_vignetting_is_cos4_of_the_angle_to_the_axis() -> None:
@@ -27,7 +28,7 @@ def test_vignetting_is_cos4_of_the_angle_to_the_axis() -> None:
 def test_the_nominal_calibration_knows_this_vignetting() -> None:
     distortion = (0.05, 0.0, 0.001, 0.0, 0.0)
     camera = CameraConfig(name="a", position_mm=(300, 50, 20), width=64, height=40, distortion=distortion)
-    rig = RigConfig(cameras=(camera,))
+    rig = TwinRigConfig(cameras=(camera,))
     told = nominal_calibration(rig, lars3_sensor(rig)).vignetting(0)
     assert np.allclose(told, vignetting(PinholeCamera.from_config(camera)), rtol=1e-6)
 

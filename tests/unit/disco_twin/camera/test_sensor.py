@@ -11,8 +11,9 @@ from scipy import stats
 
 from disco_twin.camera import sensor as steps
 from disco_twin.camera.lars3 import Lars3, lars3_sensor
+from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.record import RawImage, Sensor, to_radiance
-from pipeline.geometry.nominal_rig import CameraConfig, LaserConfig, RigConfig, SensorConfig
+from pipeline.geometry.nominal_rig import CameraConfig, LaserConfig, SensorConfig
 
 F64 = NDArray[np.float64]
 VIEW = CameraConfig(name="a", position_mm=(450, 0, 0), width=192, height=124)
@@ -20,7 +21,7 @@ VIEW = CameraConfig(name="a", position_mm=(450, 0, 0), width=192, height=124)
 
 def sensor_of(**changes: float) -> Sensor:
     """The default sensor, or one with a few figures changed."""
-    return lars3_sensor(RigConfig(cameras=(VIEW,), sensor=SensorConfig.model_validate(changes)))
+    return lars3_sensor(TwinRigConfig(cameras=(VIEW,), sensor=SensorConfig.model_validate(changes)))
 
 
 def record(electrons_per_s: float, sensor: Sensor, n: int, seed: int) -> RawImage:
@@ -71,7 +72,7 @@ def test_brightest_white_spot_fits() -> None:
 
 def test_stronger_laser_stops_the_lens_down() -> None:
     lasers = (LaserConfig(wavelength_nm=532, power_mw=10), LaserConfig(wavelength_nm=635, power_mw=40))
-    sensor = lars3_sensor(RigConfig(cameras=(VIEW,), lasers=lasers))
+    sensor = lars3_sensor(TwinRigConfig(cameras=(VIEW,), lasers=lasers))
     assert sensor.responsivity[1] == pytest.approx(sensor_of().responsivity[0] / 4)
     assert sensor.responsivity[0] == pytest.approx(sensor_of().responsivity[1] / 4)
 
@@ -229,7 +230,7 @@ def test_known_record_by_hand() -> None:
 
 
 def test_steps_are_named_with_units() -> None:
-    rig = RigConfig(cameras=(VIEW,))
+    rig = TwinRigConfig(cameras=(VIEW,))
     names = [step.name for step in Lars3(lars3_sensor(rig), np.ones((1, 1), np.float32)).steps(0)]
     assert names == [
         "vignetting",

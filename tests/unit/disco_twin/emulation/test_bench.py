@@ -13,11 +13,12 @@ from twin_fakes import PLAN, RIG, Glow
 from disco_twin.emulation.bench import LAMP_LINE
 from disco_twin.emulation.emulated_rig import Emulation
 from disco_twin.emulation.twin_rig import TwinRig
+from disco_twin.scene.rig_schema import FaultsConfig
 from hw.base.errors import DeviceFault, DiscoError, InputError, Refused, Unplugged
 from hw.devices.omicron_protocol import Mode
 from hw.serial.link import Link
 from pipeline.capture.loop import capture
-from pipeline.geometry.nominal_rig import FaultsConfig, ProjectorConfig
+from pipeline.geometry.nominal_rig import ProjectorConfig
 from pipeline.stream.stream import StreamReader
 
 

@@ -14,12 +14,13 @@ from disco_twin.camera.lens import vignetting
 from disco_twin.emulation.twin_rig import TURN_S, TwinRig
 from disco_twin.faults.actual_rig import actual_rig
 from disco_twin.faults.light_faults import MODE_HOP_S, SPECKLE_CONTRAST, LaserPower, Stream, generator, speckle
+from disco_twin.scene.rig_schema import FaultsConfig, TwinRigConfig
 from hw.base.errors import DiscoError, InputError, Refused
 from hw.interface import Aim, Rig
 from hw.record import RawImage, to_radiance
 from pipeline.capture.loop import capture
 from pipeline.geometry.camera import PinholeCamera, turn
-from pipeline.geometry.nominal_rig import CameraConfig, FaultsConfig, RigConfig
+from pipeline.geometry.nominal_rig import CameraConfig
 from pipeline.plan.plan import Plan
 
 F32 = NDArray[np.float32]
@@ -41,13 +42,13 @@ class Lamp:
         return np.full((16, 24), 1e-5, np.float32)
 
 
-def config(**faults: bool) -> RigConfig:
+def config(**faults: bool) -> TwinRigConfig:
     """Two cameras, three angles, three lasers."""
     cameras = (
         CameraConfig(name="front", position_mm=(450, 0, 100), width=24, height=16),
         CameraConfig(name="back", position_mm=(-450, 0, 100), width=24, height=16),
     )
-    return RigConfig(cameras=cameras, turntable_angles_deg=(0, 120, 240), faults=FaultsConfig(**faults))
+    return TwinRigConfig(cameras=cameras, turntable_angles_deg=(0, 120, 240), faults=FaultsConfig(**faults))
 
 
 SENSOR = lars3_sensor(config())

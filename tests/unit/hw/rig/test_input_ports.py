@@ -19,9 +19,9 @@ from disco_twin.emulation.rig_rules import load_rig_file
 from disco_twin.emulation.selftest import probe, rig_file_of
 from disco_twin.emulation.served_rig import served
 from disco_twin.emulation.twin_rig import TwinRig
+from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.errors import InputError
 from hw.camera.genicam import CameraError
-from pipeline.geometry.nominal_rig import RigConfig
 
 
 def test_ports_that_cannot_be_opened_name_key_and_remedy(tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_a_capture_names_the_rig_file_s_keys_and_its_own_copy(
     """
     scene, rig, out = tmp_path / "scene.toml", tmp_path / "rig.toml", tmp_path / "out"
     scene.write_text(SCENE)
-    good = rig_file_of(RigConfig(cameras=(RIG.cameras[0],)), {})
+    good = rig_file_of(TwinRigConfig(cameras=(RIG.cameras[0],)), {})
     monkeypatch.setattr("disco_twin.run.simulate.twin_rig", lambda world, folder: TwinRig(world.scene.rig, Glow(), 5))
     command = ("capture", scene, "--out", out, "--rig", rig)
     rig.write_text(good.replace('kind = "mm-ard"\nport = "emulated"', 'kind = "mm-ard"\nport = "/dev/none"'))
@@ -196,7 +196,7 @@ def test_a_folder_for_logs_that_cannot_be(tmp_path: Path, says: Says, monkeypatc
     """Refused before any device is connected and before the scan is made. Expected: the file is as it was."""
     kept = tmp_path / "notes.txt"
     kept.write_text("kept")
-    one = RigConfig(cameras=(RIG.cameras[0],))
+    one = TwinRigConfig(cameras=(RIG.cameras[0],))
     (tmp_path / "scene.toml").write_text(SCENE)
     (tmp_path / "one.toml").write_text(rig_file_of(one, {"turntable": str(tmp_path / "none")}))
     capture = ("capture", tmp_path / "scene.toml", "--out", tmp_path / "out", "--rig", tmp_path / "one.toml")

@@ -14,20 +14,20 @@ from disco_twin.emulation.selftest import probe, rig_file_of, selftest
 from disco_twin.emulation.served_rig import emulated_devices, served
 from disco_twin.emulation.twin_rig import TwinRig
 from disco_twin.firmware.omicron import COMMANDS, Command, LaserHead
+from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.errors import SwitchedOff
 from hw.devices.omicron_protocol import Mode
 from pipeline.capture.laser_log import read_lasers
-from pipeline.geometry.nominal_rig import RigConfig
 
 
-def text(scene: RigConfig = RIG, **ports: str) -> str:
+def text(scene: TwinRigConfig = RIG, **ports: str) -> str:
     return rig_file_of(scene, ports)
 
 
 def test_real_lasers_are_armed_explicitly(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, rig = tmp_path / "scene.toml", tmp_path / "rig.toml"
     scene.write_text(SCENE)
-    config = RigConfig(cameras=(RIG.cameras[0],))
+    config = TwinRigConfig(cameras=(RIG.cameras[0],))
     rig.write_text(rig_file_of(config, {"laser1": "/dev/ttyUSB7"}))
     with pytest.raises(SystemExit) as end:
         main(["capture", str(scene), "--out", str(tmp_path / "out"), "--rig", str(rig)])
@@ -213,7 +213,7 @@ def test_devices_capture_into_a_run_folder_and_nothing_simulates_over_it(
     """`capture --rig` with everything emulated, the light being a stand-in; then the twin leaves the folder alone."""
     scene, rig, out = tmp_path / "scene.toml", tmp_path / "rig.toml", tmp_path / "out"
     scene.write_text(SCENE)
-    rig.write_text(rig_file_of(RigConfig(cameras=(RIG.cameras[0],)), {}))
+    rig.write_text(rig_file_of(TwinRigConfig(cameras=(RIG.cameras[0],)), {}))
     monkeypatch.setattr("disco_twin.run.simulate.twin_rig", lambda world, folder: TwinRig(world.scene.rig, Glow(), 5))
 
     def command(*words: str) -> tuple[int, str]:
@@ -248,10 +248,10 @@ def test_a_rig_file_is_corrected_before_the_first_image_and_the_pipeline_is_told
     """The first attempt finds no board, and takes no image: what it left may not outlive the correction."""
     scene, rig, out = tmp_path / "scene.toml", tmp_path / "rig.toml", tmp_path / "out"
     scene.write_text(SCENE)
-    rig.write_text(rig_file_of(RigConfig(cameras=(RIG.cameras[0],)), {"board": "/dev/ttyNOBODY"}))
+    rig.write_text(rig_file_of(TwinRigConfig(cameras=(RIG.cameras[0],)), {"board": "/dev/ttyNOBODY"}))
     monkeypatch.setattr("disco_twin.run.simulate.twin_rig", lambda world, folder: TwinRig(world.scene.rig, Glow(), 5))
     for port, status in (("/dev/ttyNOBODY", 2), ("emulated", 0)):
-        rig.write_text(rig_file_of(RigConfig(cameras=(RIG.cameras[0],)), {"board": port}))
+        rig.write_text(rig_file_of(TwinRigConfig(cameras=(RIG.cameras[0],)), {"board": port}))
         with pytest.raises(SystemExit) as end:
             main(["capture", str(scene), "--out", str(out), "--rig", str(rig)])
         assert end.value.code == status, capsys.readouterr().err

@@ -19,10 +19,10 @@ from calibrate_twin import (
 
 from disco_twin.camera.lars3 import Lars3, lars3_sensor
 from disco_twin.faults.actual_rig import actual_rig
+from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.errors import DiscoError
 from pipeline.calibrate import photometric, target_images
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.plan.plan import ImageAddress
 from pipeline.plan.targets import Targets
 from pipeline.stream.layout import ImageMeta
@@ -34,7 +34,7 @@ class Plates:
     """A camera's target capture, with the lens and the plates' places as they are."""
 
     folder: Path
-    rig: RigConfig
+    rig: TwinRigConfig
     targets: Targets
     lens: PinholeCamera
     poses: dict[int, F64]

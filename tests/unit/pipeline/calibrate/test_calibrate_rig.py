@@ -18,10 +18,10 @@ from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.evaluate.budget import true_calibration
 from disco_twin.faults.actual_rig import actual_rig
 from disco_twin.faults.light_faults import LaserPower
+from disco_twin.scene.rig_schema import TwinRigConfig
 from pipeline.calibrate.calibrate_rig import Measured, measure
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
 from pipeline.calibrate.figures import figures
-from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.plan.plan import load_plan
 from pipeline.stream.stream import StreamReader
 
@@ -36,7 +36,7 @@ class Judged:
     scores: dict[str, F64]
 
 
-def judge(found: Measured, rig: RigConfig, seed: int, folder: Path) -> Judged:
+def judge(found: Measured, rig: TwinRigConfig, seed: int, folder: Path) -> Judged:
     own, actual = found.calibration, actual_rig(rig, seed)
     true = true_calibration(rig, actual, nominal_calibration(rig, lars3_sensor(rig)))
     aims = load_plan(folder / "plan.json").spots
@@ -72,7 +72,7 @@ def judge(found: Measured, rig: RigConfig, seed: int, folder: Path) -> Judged:
     )
 
 
-def _steady(rig: RigConfig, seed: int) -> Calibration:
+def _steady(rig: TwinRigConfig, seed: int) -> Calibration:
     actual = actual_rig(rig, seed)
     return true_calibration(rig, actual, nominal_calibration(rig, lars3_sensor(rig)))
 
@@ -85,18 +85,18 @@ def _hits(mesh: trimesh.Trimesh, origins: F64, ways: F64) -> F64:
 
 
 @pytest.fixture(scope="module")
-def captured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RigConfig]:
+def captured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TwinRigConfig]:
     folder = tmp_path_factory.mktemp("capture")
     return folder, capture_all(folder, 11)
 
 
 @pytest.fixture(scope="module")
-def measured(captured: tuple[Path, RigConfig]) -> Measured:
+def measured(captured: tuple[Path, TwinRigConfig]) -> Measured:
     folder, rig = captured
     return measure(folder, rig, lars3_sensor(rig), world().object.mesh)
 
 
-def test_a_rig_is_calibrated_from_its_own_images(captured: tuple[Path, RigConfig], measured: Measured) -> None:
+def test_a_rig_is_calibrated_from_its_own_images(captured: tuple[Path, TwinRigConfig], measured: Measured) -> None:
     """Faults on. Expected: spots within .15 mm rms, directions within .3 degrees, white balance to .75 %."""
     (folder, rig), found = captured, measured
     judged = judge(found, rig, 11, folder)
@@ -127,7 +127,7 @@ def test_a_rig_is_calibrated_from_its_own_images(captured: tuple[Path, RigConfig
 
 
 def test_a_scan_in_a_frame_of_its_own_gives_the_same_projector(
-    captured: tuple[Path, RigConfig], measured: Measured
+    captured: tuple[Path, TwinRigConfig], measured: Measured
 ) -> None:
     """The scan is turned by 3 degrees about the axis and stands 10 mm higher: the projector moves with it.
 
@@ -145,7 +145,7 @@ def test_a_scan_in_a_frame_of_its_own_gives_the_same_projector(
     assert (np.abs(away) < 0.5 * np.sqrt(np.diag(found.covariance))).all()
 
 
-def test_the_power_of_every_image_is_known(captured: tuple[Path, RigConfig]) -> None:
+def test_the_power_of_every_image_is_known(captured: tuple[Path, TwinRigConfig]) -> None:
     """To half a percent, up to the photodiode's own gain, while the power itself drifts by far more than a tenth."""
     folder, rig = captured
     power, actual = LaserPower(rig.lasers, rig.faults, 11), actual_rig(rig, 11)
