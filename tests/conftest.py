@@ -1,4 +1,4 @@
-"""What all tests share: no display, the repository's paths."""
+"""What all tests share: no display, the repository's paths, the order in which files are given to several workers."""
 
 from __future__ import annotations
 
@@ -20,6 +20,16 @@ hypothesis.settings.register_profile(
     "disco-twin", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
 )
 hypothesis.settings.load_profile("disco-twin")
+
+
+LONGEST_FIRST = ("regression", "validation", "system")  # folders of tests; nobody waits at the end for one long file
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the files that take longest first."""
+    here = Path(__file__).parent
+    places = {name: k for k, name in enumerate(LONGEST_FIRST)}
+    items.sort(key=lambda item: places.get(item.path.relative_to(here).parts[0], len(places)))
 
 
 @pytest.fixture(scope="session")

@@ -41,6 +41,7 @@ MOMENTS: dict[str, Callable[[int], bool]] = {
 }
 
 
+@pytest.mark.timing
 @pytest.mark.parametrize(
     "case",
     [f"selftest {case}" for case in ("SIGTERM gate", "SIGHUP gate", "SIGINT gate", "SIGQUIT gate", "SIGHUP lamp")]
@@ -107,6 +108,7 @@ def whole(devices: Bench) -> Bench:
     return emulated, server, rig
 
 
+@pytest.mark.timing
 def test_ports_that_were_all_pulled_are_closed_in_the_time_of_one(
     whole: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -149,6 +151,7 @@ def test_a_laser_that_has_fallen_silent_is_waited_for_once(whole: Bench, monkeyp
     assert guard.wait(10) == IS_OFF and not any(head.on_since for head in emulated.bench.heads)
 
 
+@pytest.mark.timing
 def test_the_gate_does_not_wait_for_a_laser_that_takes_no_bytes(whole: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """Expected: gates and lamps shut at once, while telling the laser still fails."""
     emulated, _, path = whole
@@ -209,6 +212,7 @@ def test_a_driver_that_is_closed_by_itself_is_not_interrupted_either(
     assert emulated.bench.board.lines == 0
 
 
+@pytest.mark.timing
 def test_steps_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
     """At once in real time, in order on a virtual clock, and all of them where the system gives no thread."""
     wall, clock, done = WallClock(), VirtualClock(), []

@@ -23,6 +23,7 @@ from hw.safety.ports.protocol_guard import Serial
 from hw.serial.link import Link
 
 
+@pytest.mark.timing
 def test_opening_switches_off_before_anything_is_said_and_closing_does_again(
     lasers: Callable[..., Laser], ports: Callable[[Laser], Serial]
 ) -> None:
@@ -42,6 +43,7 @@ def test_opening_switches_off_before_anything_is_said_and_closing_does_again(
     assert laser.said[-2] == "SAS" and "TPP" in laser.said  # no autostart, no power: it stays off
 
 
+@pytest.mark.timing
 @pytest.mark.parametrize(
     "number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT], ids=lambda n: n.name
 )
@@ -54,6 +56,7 @@ def test_off_after_a_signal(laser: Laser, run: Run, number: signal.Signals) -> N
     program.communicate()
 
 
+@pytest.mark.timing
 @pytest.mark.parametrize("how", ["SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "fork"])
 def test_off_though_the_main_thread_is_busy_or_a_child_keeps_the_socket(laser: Laser, run: Run, how: str) -> None:
     program = run(laser, "fork" if how == "fork" else "deaf")
@@ -65,6 +68,7 @@ def test_off_though_the_main_thread_is_busy_or_a_child_keeps_the_socket(laser: L
     program.communicate()
 
 
+@pytest.mark.timing
 @pytest.mark.parametrize("how", ["exception", "exit"])
 def test_off_at_the_end_of_the_program(laser: Laser, run: Run, how: str) -> None:
     program = run(laser, how)
@@ -115,6 +119,7 @@ except DiscoError as error:
 """
 
 
+@pytest.mark.timing
 @pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="the state of a process is read in /proc")
 @pytest.mark.parametrize("number", [signal.SIGSTOP])  # the kernel drops SIGTSTP where no shell could continue it
 def test_off_while_the_program_is_stopped_which_says_so_when_it_continues(
@@ -209,6 +214,7 @@ def test_guard_and_program_killed_together_leave_it_on_until_the_next_connection
     assert not laser.on
 
 
+@pytest.mark.timing
 def test_every_guard_sees_the_signal(lasers: Callable[..., Laser], run: Run) -> None:
     """Three lasers, three guards, one signal, and a main thread that never gets to it."""
     three = [lasers() for _ in range(3)]

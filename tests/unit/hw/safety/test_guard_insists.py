@@ -191,6 +191,7 @@ def test_a_program_is_told_that_its_laser_has_not_confirmed(lasers: Callable[...
     link.close()
 
 
+@pytest.mark.timing
 def test_closing_is_heard_though_a_child_has_a_copy_of_the_socket(
     laser: Laser, ports: Callable[[Laser], Serial]
 ) -> None:
