@@ -29,10 +29,8 @@ import numpy as np
 
 import disco_twin.firmware.omicron as omicron_firmware
 import hw.devices.mm_ard as board_driver
-from disco_twin.emulation.connect import Connector, free_line, wiring_of
 from disco_twin.emulation.emulated_rig import Emulation
-from disco_twin.emulation.rig_rules import load_rig_file
-from disco_twin.emulation.selftest import rig_file_of
+from disco_twin.emulation.rig_file_of import rig_file_of
 from disco_twin.emulation.serve import Server
 from disco_twin.emulation.served_rig import emulated_devices
 from disco_twin.scene.rig_schema import TwinRigConfig
@@ -40,6 +38,8 @@ from hw.base.clock import WallClock
 from hw.devices.omicron_protocol import Mode
 from hw.interface import Aim
 from hw.record import RawImage
+from hw.rig.connect import Connector
+from hw.rig.rig_rules import load_rig_file
 from hw.rig.serial_rig import SerialRig
 from hw.serial.link import Link
 from pipeline.capture.loop import capture
@@ -89,16 +89,7 @@ def program(rig_toml: Path, folder: Path, how: str, images: int, told: Connectio
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     sys.stderr = open(os.devnull, "w")  # noqa: SIM115 - its tracebacks are expected
     board_driver.BOOT_S = 0.05
-    file = load_rig_file(rig_toml)
-    rig = SerialRig(
-        Connector(file, WallClock(), None, None).connect,
-        [wiring_of(laser) for laser in file.lasers],
-        [Blink(how, images, told)],
-        WallClock(),
-        armed=True,
-        flood_line=file.board.floodlight_line,
-        armed_line=free_line(file),
-    )
+    rig = SerialRig(Connector(load_rig_file(rig_toml)), [Blink(how, images, told)], armed=True)
     capture(rig, PLAN, folder)
 
 

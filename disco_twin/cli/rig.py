@@ -16,9 +16,8 @@ from hw.safety.signals import interruptible, raise_if_interrupted
 from pipeline.capture.loop import Interrupted
 
 if TYPE_CHECKING:
-    from disco_twin.emulation.rig_file import DevicesFile
-    from disco_twin.emulation.selftest import Finding
-    from pipeline.geometry.nominal_rig import RigConfig
+    from hw.rig.rig_file import RigFile
+    from hw.rig.selftest import DeviceFinding
 
 rig_app = typer.Typer(help="Devices: find them, test them, emulate them.")
 console = Console()
@@ -38,17 +37,17 @@ LogsOption = Annotated[
 @rig_app.command()
 def probe(rig: RigPath, scene: SceneOption = None, logs: LogsOption = None) -> None:
     """Connect to every real device and show what it is. Switches lasers off and shuts gates; nothing moves."""
-    from disco_twin.emulation.selftest import probe as run_probe
+    from hw.rig.selftest import probe as run_probe
 
-    _show(run_probe(*_loaded(rig, scene), logs))
+    _show(run_probe(*_loaded(rig, scene, logs), logs))
 
 
 @rig_app.command()
 def selftest(rig: RigPath, scene: SceneOption = None, arm: ArmOption = False, logs: LogsOption = None) -> None:
     """Move, expose and read back every real device. Lasers emit only with --arm."""
-    from disco_twin.emulation.selftest import selftest as run_selftest
+    from hw.rig.selftest import selftest as run_selftest
 
-    _show(run_selftest(*_loaded(rig, scene), arm, logs))
+    _show(run_selftest(*_loaded(rig, scene, logs), arm, logs))
 
 
 @rig_app.command()
@@ -75,20 +74,24 @@ def emulate(
             console.print("ended")
 
 
-def _loaded(path: Path, scene: Path | None) -> tuple[DevicesFile, RigConfig | None]:
-    """The rig file, and the rig of the scene that goes with it."""
-    from disco_twin.emulation.rig_rules import load_rig_file, require_scene
+def _loaded(path: Path, scene: Path | None, logs: Path | None) -> tuple[RigFile, dict[str, tuple[int, int]] | None]:
+    """The rig file, and the sizes of the cameras of the scene that goes with it."""
+    from disco_twin.experiment.run_folder import require_folder
     from disco_twin.scene.scene import load_scene
+    from hw.rig.rig_rules import load_rig_file
+    from pipeline.capture.rig_fits_scene import require_scene
 
-    file = load_rig_file(path)
-    if scene is None:
-        return file, None
-    rig = load_scene(scene).rig
-    require_scene(file, rig, path)
-    return file, rig
+    file, shapes = load_rig_file(path), None
+    if scene is not None:
+        rig = load_scene(scene).rig
+        require_scene(file, rig, path)
+        shapes = {camera.name: (camera.height, camera.width) for camera in rig.cameras}
+    if logs is not None:
+        require_folder(logs, "--logs")
+    return file, shapes
 
 
-def _show(findings: Generator[Finding, None, None]) -> None:
+def _show(findings: Generator[DeviceFinding, None, None]) -> None:
     """Print them as they come. Whatever ends that, a signal or a closed pipe, what they use is made safe first."""
     good, count = True, 0
     with interruptible(), closing(findings):

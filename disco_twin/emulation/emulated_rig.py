@@ -1,28 +1,27 @@
-"""A whole emulated rig: devices on a bench, each on a line of its own, and a `SerialRig` connected to them."""
+"""A whole emulated rig: devices on a bench, each on a line of its own, reached through the real drivers."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 
-from disco_twin.emulation.bench import FLOOD_LINE, LAMP_LINE, Bench
-from disco_twin.emulation.twin_rig import TURN_S, TwinRig, watts_per_count
+from disco_twin.emulation.bench import Bench
+from disco_twin.emulation.mirrored_devices import MirroredDevices
+from disco_twin.emulation.rig_file_of import emulated_rig_file
+from disco_twin.emulation.twin_rig import TwinRig
 from disco_twin.firmware.mm_ard import MmArdFirmware
 from disco_twin.firmware.omicron import OmicronFirmware
 from disco_twin.firmware.wire import Line
-from disco_twin.firmware.zaber import MICROSTEPS_PER_DEG, ZaberFirmware
-from hw.base.clock import Clock, VirtualClock
-from hw.devices.mm_ard import MirrorBoard
-from hw.devices.omicron import OmicronLaser
-from hw.devices.zaber import ZaberTable
-from hw.rig.serial_rig import SerialRig
-from hw.rig.wiring import Devices, LaserWiring
-from hw.serial.bytelog import ByteLog
-from hw.serial.link import Link
+from disco_twin.firmware.zaber import ZaberFirmware
+from hw.base.clock import Clock, VirtualClock, WallClock
+from hw.rig.connect import Connector, StandIns
+from hw.rig.rig_file import RigFile
+from hw.rig.serial_rig import SerialRig, open_rig
 from hw.serial.ports.protocol_memory import attach
+from pipeline.geometry.nominal_rig import RigConfig
 
 _NUMBERS = itertools.count()
 
@@ -39,51 +38,37 @@ class Emulation:
         self.lines["board"] = Line(MmArdFirmware(self.bench.board), self.clock)
         self.lines["turntable"] = Line(ZaberFirmware(self.bench.spindle), self.clock)
 
-    def wiring(self) -> list[LaserWiring]:
-        """What is plugged in where."""
-        lasers = self.bench.twin.config.lasers
-        return [LaserWiring(la.wavelength_nm, la.power_mw, i, i, watts_per_count(la)) for i, la in enumerate(lasers)]
-
     def attach(self) -> dict[str, str]:
         """Make every line a memory port; URLs by name."""
         number = next(_NUMBERS)
         return {name: attach(f"emulated-{number}-{name}", line) for name, line in self.lines.items()}
 
+    def stand_ins(self, ports: Mapping[str, str] | None = None, *, cameras: bool = True) -> StandIns:
+        """What stands in for devices that are not there.
+
+        ports: URLs of the emulated devices (memory ports if None); cameras: the simulated ones, and with them the
+        record's clock, which goes by their frames
+        """
+        ports = self.attach() if ports is None else ports
+        if not cameras:
+            return StandIns(self.clock, ports)
+        bench = self.bench
+        return StandIns(self.clock, ports, bench.cameras, bench, bench.twin.announce, MirroredDevices(bench))
+
     def serial_rig(self, logs: Path | None = None, urls: Mapping[str, str] | None = None) -> SerialRig:
-        """The rig, reached through `urls` (memory ports if None). `logs`: a folder for the byte logs."""
-        ports = self.attach() if urls is None else urls
+        """The rig with everything emulated, reached through `urls`. logs: a folder for the byte logs."""
+        connector = Connector(emulated_rig_file(self.bench.twin.config), self.stand_ins(urls), logs)
+        return SerialRig(connector, self.bench.cameras, armed=True)
 
-        def link(name: str, device: str) -> Link:
-            log = None if logs is None else ByteLog(logs / f"{name}.log")
-            return Link(ports[name], self.lines[name].firmware.baud, device, self.clock, log)
 
-        def connect() -> Devices:
-            with ExitStack() as opened:
-                heads = []
-                for i, wiring in enumerate(self.wiring()):
-                    wavelength = wiring.wavelength_nm
-                    port = link(f"laser{i}", f"laser {wavelength:g} nm")
-                    opened.callback(port.close)
-                    heads.append(OmicronLaser(port, wavelength))
-                port = link("board", "mirror board")
-                opened.callback(port.close)
-                board = MirrorBoard(port)
-                port = link("turntable", "turntable")
-                opened.callback(port.close)
-                table = ZaberTable(port, MICROSTEPS_PER_DEG, reach_s=TURN_S)
-                opened.pop_all()
-            return Devices(heads, board, table)
+def open_scene_rig(
+    file: RigFile, scene: RigConfig, twin: TwinRig | None = None, logs: Path | None = None, *, armed: bool
+) -> AbstractContextManager[SerialRig]:
+    """The rig of a scene's rig file, whatever of it is real. `twin`: where something is emulated or simulated.
 
-        steps = self.bench.twin.config.projector.steps
-        return SerialRig(
-            connect,
-            self.wiring(),
-            self.bench.cameras,
-            self.clock,
-            armed=True,
-            flood_line=FLOOD_LINE,
-            armed_line=LAMP_LINE,
-            timebase=self.bench,
-            announce=self.bench.twin.announce,
-            centre=(steps // 2, steps // 2),
-        )
+    armed: real lasers may emit. Emulated ones need no permission.
+    """
+    clock: Clock = VirtualClock() if file.all_emulated and file.simulated_cameras else WallClock()
+    stand_ins = None if twin is None else Emulation(twin, clock).stand_ins(cameras=file.simulated_cameras)
+    shapes = {camera.name: (camera.height, camera.width) for camera in scene.cameras}
+    return open_rig(file, shapes, stand_ins, logs, armed=armed)

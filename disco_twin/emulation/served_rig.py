@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_twin.emulation.selftest import rig_file_of
+from disco_twin.emulation.rig_file_of import rig_file_of
 from disco_twin.experiment.run_folder import require_folder
 from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.clock import WallClock

@@ -9,13 +9,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from disco_twin.emulation.connect import assembled
-from disco_twin.emulation.rig_file import EMULATED, DevicesFile
-from disco_twin.emulation.rig_rules import load_rig_file, require_reach, require_same, require_scene
 from disco_twin.experiment.run_folder import content_key, require_folder
 from hw.base.errors import InputError, naming
 from hw.base.files import write_atomically
+from hw.rig.rig_file import EMULATED, RigFile
+from hw.rig.rig_rules import load_rig_file
 from pipeline.capture.loop import capture
+from pipeline.capture.rig_fits_scene import require_reach, require_same, require_scene
 from pipeline.stream.files import IMAGES
 from pipeline.stream.stream import StreamReader
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from disco_twin.run.stages import Run
 
 
-def open_rig_file(run: Run, path: Path, armed: bool) -> DevicesFile:
+def open_rig_file(run: Run, path: Path, armed: bool) -> RigFile:
     """Read a rig file for a run; real lasers need to be armed explicitly."""
     file = load_rig_file(path)
     require_scene(file, run.scene.rig, path)
@@ -45,14 +45,14 @@ def open_rig_file(run: Run, path: Path, armed: bool) -> DevicesFile:
     return file
 
 
-def _begun_with(record: Path) -> DevicesFile:
+def _begun_with(record: Path) -> RigFile:
     """The rig file that a capture keeps."""
     try:
         return load_rig_file(record)
     except InputError as error:
-        remedy = "put the rig file there that the capture was begun with, or choose another --out"
         problem = f"the capture's own copy of its rig file cannot be used ({error.problem})"
-        raise InputError(problem, file=record, key=error.key, value=error.value, remedy=remedy) from error
+        remedy = "put the rig file there that the capture was begun with, or choose another --out"
+        raise error.amended(problem, file=record, remedy=remedy) from error
 
 
 def _has_images(folder: Path) -> bool:
@@ -65,6 +65,7 @@ def _has_images(folder: Path) -> bool:
 
 def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool) -> None:
     """Scan and capture; continues where it was interrupted, if the rig is the same and has not moved since."""
+    from disco_twin.emulation.emulated_rig import open_scene_rig
     from disco_twin.run import simulate
 
     file, experiment, folder = open_rig_file(run, path, armed), run.experiment, run.folder
@@ -79,13 +80,13 @@ def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool
     run.stage("scan", scan_key, lambda _: simulate.write_scan(experiment, folder.capture, real))
 
     def take_images(report: Report) -> None:
-        with naming(path), assembled(file, run.scene.rig, _twin(run, file), logs, armed=armed) as rig:
+        with naming(path), open_scene_rig(file, run.scene.rig, _twin(run, file), logs, armed=armed) as rig:
             capture(rig, experiment.plan, folder.capture, report, sensor)
 
     run.stage("capture", key, take_images, "images")
 
 
-def _twin(run: Run, file: DevicesFile) -> TwinRig | None:
+def _twin(run: Run, file: RigFile) -> TwinRig | None:
     """What simulated cameras look at; emulated devices without one need no light."""
     from disco_twin.emulation.served_rig import Darkness
     from disco_twin.emulation.twin_rig import TwinRig

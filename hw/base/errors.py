@@ -36,13 +36,23 @@ class InputError(DiscoError):
         tail = ("" if allowed is None else f" (allowed: {allowed})") + ("" if remedy is None else f". Remedy: {remedy}")
         super().__init__(f"{where}{what}{problem}{tail}")
 
+    def amended(
+        self, problem: str | None = None, *, file: str | Path | None = None, key: str | None = None,
+        remedy: str | None = None,
+    ) -> InputError:  # fmt: skip
+        """The same error, with what is given in the place of what it named."""
+        return InputError(
+            problem or self.problem,
+            file=self.file if file is None else file,
+            key=key or self.key,
+            value=self.value,
+            allowed=self.allowed,
+            remedy=remedy or self.remedy,
+        )
+
     def within(self, file: str | Path) -> InputError:
         """The same error, known to come from `file`, unless it names a file already."""
-        if self.file is not None:
-            return self
-        return InputError(
-            self.problem, file=file, key=self.key, value=self.value, allowed=self.allowed, remedy=self.remedy
-        )
+        return self if self.file is not None else self.amended(file=file)
 
 
 class Refused(DiscoError):

@@ -154,7 +154,7 @@ class MirrorBoard:
         if not 0 <= pattern < 1 << LINES:
             raise InputError("no such pattern of TTL lines", value=pattern, allowed=f"0 to {(1 << LINES) - 1}")
         if self._owed and not pattern:
-            self.shut_now()  # getting back into step takes a second
+            self.darken()  # getting back into step takes a second
         for _ in range(ATTEMPTS):
             self._exchange(bytes([*RESTART, SET_LINES, pattern]), bytes([SET_LINES]))
             found = self.lines()
@@ -170,8 +170,8 @@ class MirrorBoard:
         """Every line low."""
         self.set_lines(0)
 
-    def shut_now(self) -> None:
-        """Say so without waiting for anything, first of all when something is wrong."""
+    def darken(self) -> None:
+        """Send the command for every line low without waiting for anything, first of all when something is wrong."""
         self.link.write(bytes([*RESTART, SET_LINES, 0]))
 
     def lines(self) -> int:

@@ -52,9 +52,17 @@ class LaserIdentity:
 class OmicronLaser:
     """One laser. Connecting switches it off; `arm` and `emit` are needed before light leaves it."""
 
-    def __init__(self, link: Link, wavelength_nm: float) -> None:
-        """Identify and switch off. `wavelength_nm`: the laser that the rig expects at this port."""
-        self.link, self.framer = link, OmicronFramer()
+    def __init__(
+        self, link: Link, wavelength_nm: float, subscriber: Callable[[float], None] = lambda power_mw: None
+    ) -> None:
+        """Identify and switch off.
+
+        wavelength_nm: of the laser that the rig expects at this port; subscriber: is given the power at every beginning
+        of emission, and 0 whenever the laser is told to go dark
+
+        Raises: WrongDevice; DeviceFault where the laser does not go off.
+        """
+        self.link, self.framer, self._subscriber = link, OmicronFramer(), subscriber
         self._inbox: Inbox[str] = Inbox(link, self.framer)
         self._owed: set[str] = set()  # questions whose answer may still come
         self._silent = False  # it answered none of the questions that were to bring us back into step
@@ -221,6 +229,7 @@ class OmicronLaser:
                 failed.append(error)
                 if self._silent:
                     break
+        self._subscriber(0.0)
         if failed:
             raise failed[0]
 
@@ -278,11 +287,15 @@ class OmicronLaser:
                 problem = f"did not emit within {EMISSION_S:g} s"
                 raise NoAnswer(self.link.url, self.name, problem, "check key switch, interlock and enable pin")
             clock.sleep(POLL_S)
+        self._subscriber(self.armed_mw)
 
-    def off_now(self) -> None:
-        """Say LOf without waiting for anything, first of all when something is wrong; the CR ends what was begun."""
+    def darken(self) -> None:
+        """Send LOf without waiting for anything, first of all when something is wrong; the CR ends what was begun."""
         self._owed.add("LOf")
-        self.link.write(b"\r?LOf\r")
+        try:
+            self.link.write(b"\r?LOf\r")
+        finally:
+            self._subscriber(0.0)
 
     def require_guard(self) -> None:
         """Refuse to go on without the guard that would switch the laser off."""
@@ -302,7 +315,10 @@ class OmicronLaser:
 
     def stop_emission(self) -> None:
         """Switch the light off; it takes seconds to come back. May be asked for at any time."""
-        self._set("LOf")
+        try:
+            self._set("LOf")
+        finally:
+            self._subscriber(0.0)
 
     def reset(self) -> None:
         """Clear latched failures by a restart of the controller (seconds), and switch off."""

@@ -12,8 +12,8 @@ from hw.serial.link import Link
 POLL_S = 0.1
 
 
-class Table(Protocol):
-    """A turntable's driver: it satisfies `hw.interface.Turntable` and knows how to find its zero."""
+class TurntableDriver(Protocol):
+    """A turntable's driver: it satisfies `hw.interface.Turntable` and finds its zero."""
 
     link: Link
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from hw.base.errors import DeviceFault, Refused
-from hw.devices.mm_ard import ADC_TOP
+from hw.base.errors import Refused
+from hw.rig.emission import require_light
 
 if TYPE_CHECKING:
     from hw.rig.serial_rig import SerialRig
@@ -22,7 +22,7 @@ class GatedLaser:
     @property
     def wavelength_nm(self) -> float:
         """Nominal wavelength."""
-        return self.rig.wiring[self.index].wavelength_nm
+        return self.rig.file.lasers[self.index].wavelength_nm
 
     def open_gate(self) -> None:
         """Let light out; refused while another gate is open."""
@@ -30,16 +30,16 @@ class GatedLaser:
         if self.rig.open_gate not in (-1, self.index):
             raise Refused(f"the gate of laser {self.rig.open_gate} is open: one laser at a time")
         self.rig.last_open = self.index
-        self.rig.board().open_gate(self.rig.wiring[self.index].gate_line)
+        self.rig.board().open_gate(self.rig.file.lasers[self.index].gate_line)
 
     def close_gate(self) -> None:
         """Shut this gate; always allowed."""
         if self.rig.open_gate == self.index:
-            self.rig.board().switch(self.rig.wiring[self.index].gate_line, False)
+            self.rig.board().switch(self.rig.file.lasers[self.index].gate_line, False)
 
     def darken(self) -> None:
-        """Every gate and laser is told off; closing the gate then confirms."""
-        self.rig.cut()
+        """Every gate and laser is told to go dark; closing the gate then confirms."""
+        self.rig.darken()
 
 
 @dataclass
@@ -55,15 +55,15 @@ class Mirrors:
 
 
 @dataclass
-class Turning:
-    """The turntable."""
+class SafeTurntable:
+    """The turntable, which stands still while a gate is open."""
 
     rig: SerialRig
 
     def move(self, angle_rad: float) -> None:
         """Turn to an angle; returns when the table stands still."""
         self.rig.require_dark("turntable")
-        self.rig.devices().table.move(angle_rad)
+        self.rig.drivers().table.move(angle_rad)
 
 
 @dataclass
@@ -79,18 +79,11 @@ class AdcPhotodiode:
         if laser < 0:
             return 0.0
         board.require_lines()
-        wiring = self.rig.wiring[laser]
-        counts = board.counts(wiring.pin)
-        watts = counts * wiring.watts_per_count
-        low, high = wiring.limits
-        if self.rig.open_gate == laser and (counts >= ADC_TOP or not low <= watts / (wiring.power_mw * 1e-3) <= high):
-            head = self.rig.devices().heads[laser]
-            problem = f"gives {1e3 * watts:.2f} mW at the photodiode instead of {wiring.power_mw:g} mW"
-            if counts >= ADC_TOP:
-                problem += " (the converter is at its top)"
-            remedy = "check the laser's interlock, the gate and the photodiode's gain"
-            raise DeviceFault(f"pin {wiring.pin}", head.name, problem, remedy)
-        return watts
+        device = self.rig.file.lasers[laser]
+        counts = board.counts(device.photodiode_pin)
+        if self.rig.open_gate == laser:
+            return require_light(counts, device, self.rig.own_mw[laser])
+        return counts * device.watts_per_count
 
 
 @dataclass
@@ -101,17 +94,13 @@ class TtlFloodlight:
 
     def on(self) -> None:
         """Switch on."""
-        self.rig.devices()
-        if self.rig.flood_line is None:
-            raise Refused("this rig has no floodlight: name its TTL line in the rig file")
-        self.rig.board().switch(self.rig.flood_line, True)
+        self.rig.board().switch(self.rig.file.board.floodlight_line, True)
 
     def off(self) -> None:
         """Switch off; always allowed. Refuses the image if the light had gone out before."""
-        line = self.rig.flood_line
-        if line is None or not self.rig.connected:
+        if not self.rig.connected:
             return
-        board = self.rig.board()
+        board, line = self.rig.board(), self.rig.file.board.floodlight_line
         try:
             if board.lit(line):
                 board.require_lines()

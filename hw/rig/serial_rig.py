@@ -2,29 +2,28 @@
 
 The board moves the mirrors, opens the gates, switches the floodlight and reads the photodiode. Lasers stay powered
 through a scan, since emission takes seconds to start: between images they are dark because their gates are shut.
-Whatever is emulated or simulated comes in by the port's name, the cameras and the timebase.
+Whatever is emulated or simulated is handed in (`hw.rig.connect.StandIns`).
 """
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from hw.base.clock import Clock, Elapsed, Timebase, side_by_side
-from hw.base.errors import DeviceFault, Refused, SwitchedOff, Unplugged
+from hw.base.clock import Elapsed, Timebase
+from hw.base.errors import InputError, Refused
 from hw.interface import Aim, Camera, Floodlight, Laser, LaserReading, Photodiode, Projector, Turntable
-from hw.rig.parts import AdcPhotodiode, GatedLaser, Mirrors, TtlFloodlight, Turning
-from hw.rig.verified_board import HEARD_S, VerifiedBoard
-from hw.rig.wiring import Board, Closable, Devices, LaserDriver, LaserWiring
-from hw.safety.signals import raise_if_interrupted, uninterrupted
-
-log = logging.getLogger(__name__)
-
-GUARDS_EVERY_S = 0.5  # while lasers warm up
-DARK_COUNTS = 8  # of the converter's 1023, with every gate shut
+from hw.rig.connect import Connector, StandIns, keys_named, open_camera, require_black
+from hw.rig.drivers import Drivers, LaserDriver
+from hw.rig.emission import begin_emission, check_lasers
+from hw.rig.parts import AdcPhotodiode, GatedLaser, Mirrors, SafeTurntable, TtlFloodlight
+from hw.rig.rig_file import GenicamDevice, RigFile
+from hw.rig.verified_board import VerifiedBoard
+from hw.safety.signals import uninterrupted
 
 
 class SerialRig:
@@ -32,39 +31,26 @@ class SerialRig:
 
     def __init__(
         self,
-        connect: Callable[[], Devices],
-        wiring: Sequence[LaserWiring],
+        connector: Connector,
         cameras: Sequence[Camera],
-        clock: Clock,
         *,
         armed: bool,
-        flood_line: int | None = None,
-        armed_line: int | None = None,
-        warm_up_s: float = 0.0,
-        power_tolerance: float = 0.1,
-        timebase: Timebase | None = None,
-        announce: Callable[[Sequence[Aim]], None] | None = None,
-        centre: tuple[int, int] = (2048, 2048),
         in_the_dark: Callable[[], object] = lambda: None,
     ) -> None:
-        """`connect` shuts every line; if it fails it closes what it opened. `centre`: where the mirrors stand first.
+        """armed: lasers may emit; without it the rig refuses to be entered, before anything is connected.
 
-        armed: lasers may emit; without it the rig refuses to be entered, before anything is connected.
-        armed_line: a TTL line that is high as long as the rig is on: a warning lamp, and the witness that the board has
-        not been reset since (it would have forgotten where the mirrors stand). warm_up_s: from emission to the first
-        image; then every laser's own reading must lie within `power_tolerance` of its set point. in_the_dark: what is
-        to be measured, and may be refused, while lasers and lamps are off and the gates shut.
+        in_the_dark: what is to be measured, and may be refused, while lasers and lamps are off and the gates shut
         """
-        self._connect, self.wiring, self.clock, self._armed = connect, tuple(wiring), clock, armed
-        self.flood_line, self._armed_line, self._announce, self._centre = flood_line, armed_line, announce, centre
-        self._warm_up_s, self._power_tolerance, self._in_the_dark = warm_up_s, power_tolerance, in_the_dark
-        self._timebase: Timebase = Elapsed(clock) if timebase is None else timebase
-        self._devices: Devices | None = None
+        self.file, self.clock, self._armed, self._in_the_dark = connector.file, connector.clock, armed, in_the_dark
+        self._connector, stand_ins = connector, connector.stand_ins
+        self._timebase: Timebase = Elapsed(self.clock) if stand_ins.timebase is None else stand_ins.timebase
+        self._drivers: Drivers | None = None
         self._board: VerifiedBoard | None = None
+        self.own_mw = [0.0] * len(self.file.lasers)  # the lasers' own readings when they were checked last
         self.last_open = -1  # the laser whose gate was opened last: whose photodiode is to be read
-        self.lasers: Sequence[Laser] = [GatedLaser(self, i) for i in range(len(self.wiring))]
+        self.lasers: Sequence[Laser] = [GatedLaser(self, i) for i in range(len(self.file.lasers))]
         self.projector: Projector = Mirrors(self)
-        self.turntable: Turntable = Turning(self)
+        self.turntable: Turntable = SafeTurntable(self)
         self.cameras: Sequence[Camera] = list(cameras)
         self.photodiode: Photodiode = AdcPhotodiode(self)
         self.floodlight: Floodlight = TtlFloodlight(self)
@@ -72,26 +58,23 @@ class SerialRig:
     # ---- on and off
 
     def __enter__(self) -> Self:
-        """Connect, home, light the warning lamp, then arm the lasers and wait for their emission, behind shut gates."""
+        """Connect, home, light the warning lamp, then arm the lasers and wait for their emission, behind shut gates.
+
+        Raises: Refused unless armed; whatever a device reports, everything being off and closed again then.
+        """
         if not self._armed:
             raise Refused(
                 "the rig is not armed, and its lasers would emit. Remedy: see to interlock, door and goggles, then arm "
                 "it (--arm; in Python armed=True)"
             )
-        self._devices = devices = self._connect()
+        self._drivers = drivers = self._connector.connect()
         try:
-            gates = [wiring.gate_line for wiring in self.wiring]
-            self._board = board = VerifiedBoard(devices.board, self.clock, gates, self.cut)
+            gates = [laser.gate_line for laser in self.file.lasers]
+            self._board = board = VerifiedBoard(drivers.board, self.clock, gates, self.darken)
             self._in_the_dark()
-            board.aim(*self._centre)
-            devices.table.home()
-            if self._armed_line is not None:
-                board.switch(self._armed_line, True)
-            for head, wiring in zip(devices.heads, self.wiring, strict=True):
-                head.arm(wiring.power_mw)
-                head.emit()
-            warm_up(self.clock, self._warm_up_s, devices.heads)
-            self.check()
+            board.aim(*self.file.board.centre)
+            drivers.table.home()
+            self._checked(begin_emission(self.clock, self.file, board, self._numbered()))
         except BaseException:
             self.make_safe()
             raise
@@ -110,35 +93,41 @@ class SerialRig:
         draw out for seconds. Ctrl-C waits until all that is done.
         """
         with uninterrupted():
-            devices, self._devices, self._board, self.last_open = self._devices, None, None, -1
-            if devices is None:
+            drivers, self._drivers, self._board, self.last_open = self._drivers, None, None, -1
+            if drivers is None:
                 return
             try:
-                cut_light(self.clock, devices.board, devices.heads)
+                drivers.darken()
             finally:
-                close_all(self.clock, [devices.board, *devices.heads, devices.table])
+                drivers.close()
 
-    def cut(self) -> None:
+    def darken(self) -> None:
         """Tell gates and lasers to go dark without waiting for answers; the rig must be entered anew then."""
-        if self._devices is None:
+        if self._drivers is None:
             return
         if self._board is not None:
             self._board.distrusted = True
-        cut_light(self.clock, self._devices.board, self._devices.heads)
+        self._drivers.darken()
 
     @property
     def connected(self) -> bool:
         """Whether the devices are there."""
-        return self._devices is not None
+        return self._drivers is not None
 
-    def devices(self) -> Devices:
-        """The drivers; refused outside `with rig:`."""
-        if self._devices is None:
+    def drivers(self) -> Drivers:
+        """The drivers.
+
+        Raises: Refused outside `with rig:`.
+        """
+        if self._drivers is None:
             raise Refused("the rig is switched off: use it inside `with rig:`")
-        return self._devices
+        return self._drivers
 
     def board(self) -> VerifiedBoard:
-        """The board; refused outside `with rig:`."""
+        """The board.
+
+        Raises: Refused outside `with rig:`.
+        """
         if self._board is None:
             raise Refused("the rig is switched off: use it inside `with rig:`")
         return self._board
@@ -155,8 +144,7 @@ class SerialRig:
 
     def announce(self, aims: Sequence[Aim]) -> None:
         """Simulated cameras work ahead; real ones ignore it."""
-        if self._announce is not None:
-            self._announce(aims)
+        self._connector.stand_ins.announce(aims)
 
     # ---- what must hold
 
@@ -165,16 +153,18 @@ class SerialRig:
 
         Asked once a view: a laser that ages or hops is seen by its own reading whatever the gate and the fibre do, and
         a gate that is told shut and lets light through by the photodiode behind it.
+
+        Raises: DeviceFault; Refused while a gate is open.
         """
         if self.open_gate >= 0:
             raise Refused(f"the lasers are checked in the dark, and the gate of laser {self.open_gate} is open")
-        readings = []
-        for head, wiring in zip(self.devices().heads, self.wiring, strict=True):
-            own_mw = head.require_power(self._power_tolerance)
-            counts = self.board().counts(wiring.pin)
-            remedy = f"see that the gate of {head.name} shuts, shade the photodiode, or correct its offset"
-            require_darkness(counts, wiring.pin, head.name, "with every gate shut", remedy)
-            readings.append(LaserReading(1e-3 * wiring.power_mw, 1e-3 * own_mw, counts * wiring.watts_per_count))
+        return self._checked(check_lasers(self.file, self.board(), self._numbered()))
+
+    def _numbered(self) -> Mapping[int, LaserDriver]:
+        return dict(enumerate(self.drivers().lasers))
+
+    def _checked(self, readings: Sequence[LaserReading]) -> Sequence[LaserReading]:
+        self.own_mw = [1e3 * reading.own_w for reading in readings]
         return readings
 
     @property
@@ -183,67 +173,55 @@ class SerialRig:
         board = self._board
         if board is None:
             return -1
-        return next((i for i, wiring in enumerate(self.wiring) if board.lit(wiring.gate_line)), -1)
+        return next((i for i, laser in enumerate(self.file.lasers) if board.lit(laser.gate_line)), -1)
 
     def require_guards(self) -> None:
         """Refuse an image while nobody would switch a laser off, or after one was: asked at every image."""
-        for head in self.devices().heads:
-            head.require_guard()
+        for laser in self.drivers().lasers:
+            laser.require_guard()
 
     def require_dark(self, what: str) -> None:
         """Refuse to move anything while laser light is let out."""
-        self.devices()
+        self.drivers()
         if self.open_gate >= 0:
             raise Refused(f"the {what} must not move while the gate of laser {self.open_gate} is open")
 
 
-def warm_up(clock: Clock, seconds: float, heads: Sequence[LaserDriver]) -> None:
-    """Wait while lasers that emit become steady, and end at once where the guard of one ends, or the program is to."""
-    left = seconds
-    while left > 0:
-        clock.sleep(min(left, GUARDS_EVERY_S))
-        left -= GUARDS_EVERY_S
-        raise_if_interrupted()
-        for head in heads:
-            head.require_guard()
+@contextmanager
+def open_rig(
+    file: RigFile,
+    shapes: Mapping[str, tuple[int, int]],
+    stand_ins: StandIns | None = None,
+    logs: Path | None = None,
+    *,
+    armed: bool,
+) -> Iterator[SerialRig]:
+    """The rig of a file, its cameras open; entering it connects the rest.
 
+    shapes: (height, width) of every GenICam camera, by its name; logs: the folder of the byte logs; armed: real lasers
+    may emit, emulated ones need no permission
 
-def cut_light(clock: Clock, board: Board, heads: Sequence[LaserDriver]) -> None:
-    """Tell gates and lasers to go dark, without waiting for answers; returns when they have heard it."""
-    interruptions = _each(clock, [board.shut_now, *(head.off_now for head in heads)])
-    clock.sleep(HEARD_S)
-    for interruption in interruptions:
-        raise interruption
-
-
-def close_all(clock: Clock, devices: Sequence[Closable]) -> None:
-    """Close them side by side, whatever the others raise; Ctrl-C waits until then."""
-    with uninterrupted():
-        for interruption in _each(clock, [device.close for device in devices]):
-            raise interruption
-
-
-def _each(clock: Clock, steps: Sequence[Callable[[], None]]) -> list[BaseException]:
-    """Take every step, whatever the others raise, and at once where the clock is real. What interrupted any of them."""
-    interruptions: list[BaseException] = []
-
-    def attempt(step: Callable[[], None]) -> None:
-        try:
-            step()
-        except Unplugged as error:
-            quiet = error.known or isinstance(error, SwitchedOff)  # its guard was faster, and speaks up if it fails
-            log.log(logging.INFO if quiet else logging.ERROR, "making the rig safe: %s", error)
-        except Exception as error:  # noqa: BLE001 - the other devices matter more
-            log.error("making the rig safe: %s", error)
-        except BaseException as error:  # noqa: BLE001 - raised when the other devices are off
-            interruptions.append(error)
-
-    side_by_side(clock, [partial(attempt, step) for step in steps])
-    return interruptions
-
-
-def require_darkness(counts: int, pin: int, laser: str, when: str, remedy: str) -> None:
-    """Refuse a photodiode's reading that is not dark. laser: whose photodiode; when: why it should be."""
-    if counts > DARK_COUNTS:
-        problem = f"reads {counts} counts {when} (allowed: {DARK_COUNTS})"
-        raise DeviceFault(f"pin {pin}", f"the photodiode of {laser}", problem, remedy)
+    Raises: InputError where a simulated camera is not handed in; CameraError.
+    """
+    connector = Connector(file, stand_ins, logs)
+    with keys_named(file), ExitStack() as opened:
+        cameras: list[Camera] = []
+        black: list[Callable[[], float]] = []
+        for device in file.cameras:
+            if isinstance(device, GenicamDevice):
+                assert file.sensor is not None  # the rig file's own check
+                camera = open_camera(file, device, shapes[device.name])
+                opened.callback(camera.close)
+                black.append(partial(require_black, camera, file.sensor))
+                cameras.append(camera)
+        if file.simulated_cameras:
+            cameras = list(connector.stand_ins.cameras)
+            if not cameras:
+                problem, remedy = "are simulated, and none are handed in", "name GenICam cameras"
+                raise InputError(problem, file=file.path, key="cameras", remedy=remedy)
+        yield SerialRig(
+            connector,
+            cameras,
+            armed=armed or not file.real_lasers,
+            in_the_dark=lambda: [measure() for measure in black],
+        )

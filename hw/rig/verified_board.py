@@ -12,13 +12,12 @@ from typing import TypeVar
 
 from hw.base.clock import Clock
 from hw.base.errors import DeviceFault, NoAnswer
-from hw.rig.wiring import Board
+from hw.rig.drivers import HEARD_S, Board
 
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-HEARD_S = 0.02  # until what was told without waiting for an answer has been understood
 ATTEMPTS = 3
 PROMPT_S = 0.15  # answers take a few milliseconds on an idle computer; a repeated question takes 200 or more
 SETTLE_S = 0.005  # of the galvos, after the DAC has taken both values
@@ -27,11 +26,11 @@ SETTLE_S = 0.005  # of the galvos, after the DAC has taken both values
 class VerifiedBoard:
     """A board whose lines are all low, what it is told from then on, and whether it still does that.
 
-    `cut`: switch every light off in a hurry.
+    darken: tells every light to go out, without waiting for an answer
     """
 
-    def __init__(self, board: Board, clock: Clock, gate_lines: Sequence[int], cut: Callable[[], None]) -> None:
-        self.board, self._clock, self._cut = board, clock, cut
+    def __init__(self, board: Board, clock: Clock, gate_lines: Sequence[int], darken: Callable[[], None]) -> None:
+        self.board, self._clock, self._darken = board, clock, darken
         self._gates = sum(1 << line for line in gate_lines)
         self._pattern = 0
         self._opening = False  # a gate is just being opened
@@ -42,12 +41,12 @@ class VerifiedBoard:
     def _lost(self) -> None:
         """An answer was lost: no light while that is found out, and no opening is repeated."""
         if self._opening:
-            self.board.shut_now()
+            self.board.darken()
             self._clock.sleep(HEARD_S)
             raise NoAnswer("board", "the mirror board", "did not confirm an open gate", "check its cable")
         if self._pattern & self._gates:
             self.distrusted = True
-            self._cut()
+            self._darken()
 
     def ask(self, question: Callable[[Board], T]) -> T:
         """Say something to the board. If that had to be repeated, the mirrors are not trusted any more.

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from twin_fakes import RIG
 
-from disco_twin.emulation.selftest import rig_file_of
+from disco_twin.emulation.rig_file_of import rig_file_of
 
 CAMERAS = """
 [[cameras]]

@@ -17,7 +17,7 @@ from twin_fakes import RIG
 
 from disco_twin.emulation.bench import FLOOD_LINE, LAMP_LINE
 from disco_twin.emulation.emulated_rig import Emulation
-from disco_twin.emulation.selftest import rig_file_of
+from disco_twin.emulation.rig_file_of import rig_file_of
 from disco_twin.emulation.serve import Server
 from disco_twin.scene.rig_schema import TwinRigConfig
 

@@ -176,7 +176,7 @@ def test_shut_now_waits_for_nothing() -> None:
         board.set_lines(0b11)
         board.link.write(unfinished)
         before = bench.now()
-        board.shut_now()
+        board.darken()
         assert bench.now() == before
         assert bench.head.lines == 0
         board.set_mirrors(3, 4)

@@ -50,7 +50,7 @@ def test_off_now_waits_for_nothing_and_its_answer_answers_nothing_else() -> None
     laser = emitting(bench)
     laser.link.write(b"?MD")  # cut short
     before = bench.now()
-    laser.off_now()
+    laser.darken()
     assert bench.now() == before
     assert bench.head.emission(bench.now()) == 0.0
     assert laser.ask("GSN") == "4711"
@@ -154,7 +154,7 @@ def test_a_silent_laser_is_closed_in_the_time_of_one_question(told: bool) -> Non
     laser = emitting(bench)
     bench.line.firmware.feed = lambda data, now: []  # type: ignore[method-assign]
     if told:
-        laser.off_now()
+        laser.darken()
     begun = bench.now()
     with pytest.raises(NoAnswer, match=r"LOf"):
         laser.close()

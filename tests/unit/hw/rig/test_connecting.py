@@ -10,15 +10,15 @@ import pytest
 from twin_fakes import RIG, Glow
 
 from disco_twin.emulation.bench import FLOOD_LINE, LAMP_LINE
-from disco_twin.emulation.connect import Connector
 from disco_twin.emulation.emulated_rig import Emulation
-from disco_twin.emulation.rig_rules import load_rig_file
-from disco_twin.emulation.selftest import rig_file_of
+from disco_twin.emulation.rig_file_of import rig_file_of
 from disco_twin.emulation.twin_rig import TwinRig
 from hw.base.errors import DeviceError, InputError
 from hw.devices.mm_ard import MirrorBoard
 from hw.devices.omicron import OmicronLaser
 from hw.devices.omicron_protocol import Mode
+from hw.rig.connect import Connector
+from hw.rig.rig_rules import load_rig_file
 
 LIT = 1 << LAMP_LINE | 1 << FLOOD_LINE | 0b11
 
@@ -35,7 +35,7 @@ def left_on() -> Emulation:
 def connector(emulated: Emulation, folder: Path, change: tuple[str, str] = ("", "")) -> Connector:
     path = folder / "rig.toml"
     path.write_text(rig_file_of(RIG, {}).replace(*change, 1))
-    return Connector(load_rig_file(path), emulated.clock, emulated, None)
+    return Connector(load_rig_file(path), emulated.stand_ins())
 
 
 def silent(name: str) -> Callable[[Emulation], None]:

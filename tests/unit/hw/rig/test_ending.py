@@ -22,15 +22,15 @@ from rig_programs import (
     started,
 )
 
-from disco_twin.emulation.connect import Connector, assembled, free_line, wiring_of
-from disco_twin.emulation.emulated_rig import Emulation
-from disco_twin.emulation.rig_rules import load_rig_file
-from disco_twin.emulation.selftest import rig_file_of
+from disco_twin.emulation.emulated_rig import Emulation, open_scene_rig
+from disco_twin.emulation.rig_file_of import rig_file_of
 from hw.base.clock import VirtualClock, WallClock, side_by_side
 from hw.base.errors import DeviceFault
 from hw.devices.mm_ard import MirrorBoard
 from hw.devices.omicron import OmicronLaser
 from hw.devices.omicron_protocol import Mode
+from hw.rig.connect import Connector
+from hw.rig.rig_rules import load_rig_file
 from hw.rig.serial_rig import SerialRig
 from hw.safety.guard import IS_OFF
 
@@ -85,19 +85,9 @@ def test_probe_is_ended_like_the_others(devices: Bench, tmp_path: Path) -> None:
     assert process.returncode == 130 and said(err).startswith("disco-twin: stopped: "), err
 
 
-def serial_rig(rig: Path, **more: object) -> SerialRig:
+def serial_rig(rig: Path) -> SerialRig:
     """The rig of a file, in this process, without a camera."""
-    file, clock = load_rig_file(rig), WallClock()
-    return SerialRig(
-        Connector(file, clock, None, None).connect,
-        [wiring_of(laser) for laser in file.lasers],
-        [],
-        clock,
-        armed=True,
-        flood_line=file.board.floodlight_line,
-        armed_line=free_line(file),
-        **more,  # type: ignore[arg-type]
-    )
+    return SerialRig(Connector(load_rig_file(rig)), [], armed=True)
 
 
 @pytest.fixture
@@ -117,7 +107,7 @@ def test_ports_that_were_all_pulled_are_closed_in_the_time_of_one(
     monkeypatch.setattr("hw.safety.ports.protocol_guard.END_S", 2.0)
     rig = serial_rig(path)
     rig.__enter__()
-    guards = [head.link._port._guard for head in rig.devices().heads]  # type: ignore[attr-defined]
+    guards = [head.link._port._guard for head in rig.drivers().lasers]  # type: ignore[attr-defined]
     for name in list(server.urls):
         server.unplug(name)
     begun = time.monotonic()
@@ -139,7 +129,7 @@ def test_a_laser_that_has_fallen_silent_is_waited_for_once(whole: Bench, monkeyp
     rig = serial_rig(path)
     rig.__enter__()
     rig.lasers[0].open_gate()
-    firmware, guard = emulated.lines["laser0"].firmware, rig.devices().heads[0].link._port._guard  # type: ignore[attr-defined]
+    firmware, guard = emulated.lines["laser0"].firmware, rig.drivers().lasers[0].link._port._guard  # type: ignore[attr-defined]
     hear = firmware.feed
     firmware.feed = lambda data, now: []  # type: ignore[method-assign]
     begun = time.monotonic()
@@ -160,7 +150,7 @@ def test_the_gate_does_not_wait_for_a_laser_that_takes_no_bytes(whole: Bench, mo
     rig.lasers[0].open_gate()
     dark: list[float] = []
     at_pattern(emulated, lambda pattern: not pattern, lambda: dark.append(time.monotonic()))
-    monkeypatch.setattr(OmicronLaser, "off_now", lambda self: time.sleep(2.0))
+    monkeypatch.setattr(OmicronLaser, "darken", lambda self: time.sleep(2.0))
     begun = time.monotonic()
     rig.make_safe()
     assert dark[0] - begun < 1.0
@@ -198,7 +188,7 @@ def test_a_driver_that_is_closed_by_itself_is_not_interrupted_either(
 ) -> None:
     """As the self-test closes the board."""
     emulated, _, path = whole
-    board = Connector(load_rig_file(path), WallClock(), None, None).board()
+    board = Connector(load_rig_file(path)).board()
     board.set_lines(LAMP | GATE)
     exchange = MirrorBoard._exchange
 
@@ -285,13 +275,13 @@ def test_the_black_level_is_measured_after_everything_was_switched_off(
     text = path.read_text()
     path.write_text(text[: text.index("[[cameras]]")] + SENSOR)
     camera = Black(emulated, level)
-    monkeypatch.setattr("disco_twin.emulation.connect.open_camera", lambda device, sensor, shape: camera)
+    monkeypatch.setattr("hw.rig.serial_rig.open_camera", lambda device, sensor, shape: camera)
     bench = emulated.bench
     bench.board.set_pattern(LAMP | FLOOD | GATE)
     for head in bench.heads:
         head.mode, head.level, head.on_since = int(Mode.BIAS | Mode.RELEASE), 1.0, bench.clock.now() - 60.0
     assert bench.light() == [0]
-    with assembled(load_rig_file(path), ONE, armed=True) as rig:
+    with open_scene_rig(load_rig_file(path), ONE, armed=True) as rig:
         assert camera.seen == []
         if level == 64.5:
             with rig:

@@ -12,9 +12,9 @@ from rig_fakes import quick
 from rig_files import CAMERAS, rig_file
 from twin_fakes import RIG
 
-from disco_twin.emulation.rig_rules import load_rig_file
-from disco_twin.emulation.selftest import probe, selftest
 from disco_twin.emulation.served_rig import served
+from hw.rig.rig_rules import load_rig_file
+from hw.rig.selftest import probe, selftest
 
 # ---- the file itself
 
@@ -193,7 +193,7 @@ def test_the_self_test_compares_photodiode_own_reading_and_meter(
     laser's own reading asks for; for the others the value that the power meter asks for.
     """
     quick(monkeypatch)
-    monkeypatch.setattr("disco_twin.emulation.connect.Connector.meter", lambda connect: Meter())
+    monkeypatch.setattr("hw.rig.connect.Connector.meter", lambda connect: Meter())
     with served(RIG, 3, tmp_path / "ports") as path:
         content = path.read_text()
         right = float(re.findall(r"watts_per_count = (\S+)", content)[0])

@@ -15,13 +15,14 @@ from rig_files import CAMERAS, rig_file
 from twin_fakes import RIG, Glow
 
 from disco_twin.cli.app import main
-from disco_twin.emulation.rig_rules import load_rig_file
-from disco_twin.emulation.selftest import probe, rig_file_of
+from disco_twin.emulation.rig_file_of import rig_file_of
 from disco_twin.emulation.served_rig import served
 from disco_twin.emulation.twin_rig import TwinRig
 from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.errors import InputError
 from hw.camera.genicam import CameraError
+from hw.rig.rig_rules import load_rig_file
+from hw.rig.selftest import probe
 
 
 def test_ports_that_cannot_be_opened_name_key_and_remedy(tmp_path: Path) -> None:
@@ -143,7 +144,7 @@ def test_a_camera_that_cannot_be_opened_names_its_key(
 
     monkeypatch.setattr("hw.camera.viva_grabber.VivaGrabber", grabber)
     path = rig_file(tmp_path, cameras=CAMERAS)
-    first, second = probe(load_rig_file(path), RIG)
+    first, second = probe(load_rig_file(path), {"front": (31, 48), "back": (31, 48)})
     assert first.text.startswith(f"{path}: the camera needs the package") and "Remedy: pip" in first.text
     assert second.text.startswith(f"{path}: cameras[1].{said}") and "Remedy: " in second.text
 

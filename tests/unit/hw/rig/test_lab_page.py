@@ -7,9 +7,10 @@ from pathlib import Path
 
 import trimesh
 
-from disco_twin.emulation.rig_rules import load_rig_file, require_scene
 from hw.base.config import load_toml
+from hw.rig.rig_rules import load_rig_file
 from pipeline.capture.import_folder import COLUMNS, CaptureDescription
+from pipeline.capture.rig_fits_scene import require_scene
 from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
 
 

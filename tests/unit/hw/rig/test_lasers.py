@@ -81,7 +81,7 @@ def test_a_gate_that_is_told_shut_and_leaks_is_refused() -> None:
         ):
             rig.check()
         emulated.bench.board.sample = lambda pin: 8
-        assert [reading.dark_w for reading in rig.check()] == [8 * w.watts_per_count for w in emulated.wiring()]
+        assert [reading.dark_w for reading in rig.check()] == [8 * device.watts_per_count for device in rig.file.lasers]
         with (
             gate_open(rig.lasers[0]),
             pytest.raises(Refused, match="checked in the dark, and the gate of laser 0 is open"),

@@ -9,14 +9,15 @@ from rig_fakes import SCENE, quick
 from twin_fakes import RIG, Glow
 
 from disco_twin.cli.app import main
-from disco_twin.emulation.rig_rules import load_rig_file
-from disco_twin.emulation.selftest import probe, rig_file_of, selftest
+from disco_twin.emulation.rig_file_of import rig_file_of
 from disco_twin.emulation.served_rig import emulated_devices, served
 from disco_twin.emulation.twin_rig import TwinRig
 from disco_twin.firmware.omicron import COMMANDS, Command, LaserHead
 from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.errors import SwitchedOff
 from hw.devices.omicron_protocol import Mode
+from hw.rig.rig_rules import load_rig_file
+from hw.rig.selftest import probe, selftest
 from pipeline.capture.laser_log import read_lasers
 
 
@@ -84,14 +85,14 @@ def test_ctrl_c_in_a_selftest_does_not_go_on_to_the_next_laser(tmp_path: Path, m
         def emit(self) -> None:
             raise KeyboardInterrupt
 
-        def off_now(self) -> None:
+        def darken(self) -> None:
             told.append(True)
 
         def close(self) -> None:
             if tried:
                 raise SwitchedOff("guard://laser0", "the port of the laser", "is closed", "none")
 
-    monkeypatch.setattr("disco_twin.emulation.connect.Connector.omicron", lambda self, index: LaserDriver())
+    monkeypatch.setattr("hw.rig.connect.Connector.omicron", lambda self, index: LaserDriver())
     with served(RIG, 3, tmp_path / "ports") as path:
         findings = selftest(load_rig_file(path), None, armed=True)
         with pytest.raises(KeyboardInterrupt):
@@ -105,7 +106,7 @@ def test_no_gate_is_tested_where_a_laser_may_be_on(tmp_path: Path, monkeypatch: 
     def unreachable(self: object, index: int) -> object:
         raise SwitchedOff("laser", "the laser", "does not answer", "none")
 
-    monkeypatch.setattr("disco_twin.emulation.connect.Connector.omicron", unreachable)
+    monkeypatch.setattr("hw.rig.connect.Connector.omicron", unreachable)
     with served(RIG, 3, tmp_path / "ports") as path:
         findings = {f.name: f for f in selftest(load_rig_file(path), None, armed=False)}
     assert not findings["gates"].good and "left shut" in findings["gates"].text and "turntable" not in findings
@@ -149,8 +150,8 @@ def test_a_laser_that_says_off_and_emits_is_not_let_out(
 @pytest.mark.parametrize(
     ("fault", "says"),
     [
-        ("leaks", "counts while it emits behind its shut gate (allowed: 8)"),
-        ("saturates", "saturates its photodiode (1023 counts"),
+        ("leaks", "reads 500 counts with every gate shut (allowed: 8)"),
+        ("saturates", "(1023 counts) at the photodiode instead of 10 mW (the converter is at its top)"),
         ("reset", "it was reset"),
     ],
 )

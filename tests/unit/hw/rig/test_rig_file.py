@@ -14,16 +14,16 @@ from rig_files import CAMERAS
 from twin_fakes import PLAN, RIG, Glow
 
 from disco_twin.camera.lars3 import lars3_sensor
-from disco_twin.emulation.connect import assembled
-from disco_twin.emulation.emulated_rig import Emulation
-from disco_twin.emulation.rig_file import DevicesFile
-from disco_twin.emulation.rig_rules import load_rig_file, require_same, require_scene
-from disco_twin.emulation.selftest import rig_file_of
+from disco_twin.emulation.emulated_rig import Emulation, open_scene_rig
+from disco_twin.emulation.rig_file_of import rig_file_of
 from disco_twin.emulation.serve import Server
 from disco_twin.emulation.served_rig import emulated_devices
 from disco_twin.emulation.twin_rig import TwinRig
 from hw.base.errors import DeviceFault, InputError
+from hw.rig.rig_file import RigFile
+from hw.rig.rig_rules import load_rig_file
 from pipeline.capture.loop import Interrupted, capture
+from pipeline.capture.rig_fits_scene import require_same, require_scene
 from pipeline.capture.unmoved import RigMoved
 from pipeline.geometry.nominal_rig import LaserConfig, SensorConfig
 from pipeline.stream.stream import StreamReader
@@ -36,7 +36,7 @@ def text(**ports: str) -> str:
     return rig_file_of(RIG, ports)
 
 
-def rig_file(tmp_path: Path, content: str) -> DevicesFile:
+def rig_file(tmp_path: Path, content: str) -> RigFile:
     path = tmp_path / "rig.toml"
     path.write_text(content)
     return load_rig_file(path)
@@ -226,7 +226,7 @@ def test_another_rig_s_scene_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_emulated_rig_equals_the_direct_twin(tmp_path: Path, direct: Path) -> None:
-    with assembled(rig_file(tmp_path, text()), FAST, TwinRig(FAST, Glow(), seed=5), armed=True) as rig:
+    with open_scene_rig(rig_file(tmp_path, text()), FAST, TwinRig(FAST, Glow(), seed=5), armed=True) as rig:
         capture(rig, PLAN, tmp_path / "serial")
     assert contents(tmp_path / "serial") == contents(direct)
 
@@ -249,7 +249,7 @@ def test_simulated_cameras_see_what_real_devices_do(
     """A real turntable with simulated cameras: the same bytes. Everything real but the cameras: the same light, too."""
     emulation, urls = devices
     file = rig_file(tmp_path, text(**{name: urls[name] for name in real}))
-    with assembled(file, FAST, TwinRig(FAST, Glow(), seed=5), armed=True) as rig:
+    with open_scene_rig(file, FAST, TwinRig(FAST, Glow(), seed=5), armed=True) as rig:
         capture(rig, PLAN, tmp_path / "mixed")
     with StreamReader(tmp_path / "mixed") as mixed, StreamReader(direct) as whole:
         for index in range(len(PLAN)):
@@ -277,7 +277,7 @@ def test_a_mixed_rig_shoots_its_reference_again(
             if done == stop_at:
                 raise KeyboardInterrupt
 
-        with assembled(file, FAST, TwinRig(FAST, Glow(), seed=5), armed=True) as rig:
+        with open_scene_rig(file, FAST, TwinRig(FAST, Glow(), seed=5), armed=True) as rig:
             capture(rig, PLAN, out, progress, sensor)
 
     with pytest.raises(Interrupted):
@@ -297,16 +297,16 @@ def test_limits_zero_and_direction(tmp_path: Path) -> None:
     content = text().replace("floodlight_line = 5", "floodlight_line = 5\nlimits_u = [1000, 3000]")
     content = content.replace("[turntable]", "[turntable]\nzero_deg = 30\ndirection = -1")
     twin = TwinRig(RIG, Glow(), seed=5)
-    with assembled(rig_file(tmp_path, content), RIG, twin, armed=True) as rig, rig:
+    with open_scene_rig(rig_file(tmp_path, content), RIG, twin, armed=True) as rig, rig:
         with pytest.raises(InputError, match=r"board.limits_u = 3001: .*1000 to 3000.*Remedy"):
             rig.projector.move(3001, 2000)
         rig.turntable.move(np.deg2rad(50))
-        assert rig.devices().table.angle_rad() == pytest.approx(np.deg2rad(50), abs=1e-4)
+        assert rig.drivers().table.angle_rad() == pytest.approx(np.deg2rad(50), abs=1e-4)
 
 
 def test_a_laser_that_is_too_weak_is_refused(tmp_path: Path) -> None:
-    with assembled(rig_file(tmp_path, text()), RIG, twin := TwinRig(RIG, Glow(), seed=5), armed=True) as rig:
-        heads = rig._connect.__self__.emulation.bench.heads  # type: ignore[attr-defined]
+    with open_scene_rig(rig_file(tmp_path, text()), RIG, twin := TwinRig(RIG, Glow(), seed=5), armed=True) as rig:
+        heads = rig._connector.stand_ins.timebase.heads  # type: ignore[attr-defined]
         type(heads[1]).emission, before = (lambda self, now: 0.8 * self.level), type(heads[1]).emission
         try:
             with pytest.raises(DeviceFault, match=r"laser 635 nm emits 8.00 mW instead of 10 mW \(allowed: 10 % off\)"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,13 +12,13 @@ from rig_fakes import at_image, at_message, emulation, reset
 from twin_fakes import PLAN, RIG, Glow
 
 from disco_twin.camera.lars3 import lars3_sensor
-from disco_twin.emulation.connect import assembled
-from disco_twin.emulation.rig_rules import load_rig_file
-from disco_twin.emulation.selftest import rig_file_of
+from disco_twin.emulation.emulated_rig import open_scene_rig
+from disco_twin.emulation.rig_file_of import rig_file_of
 from disco_twin.emulation.twin_rig import TwinRig
 from hw.base.errors import DeviceFault, DiscoError, Refused, SwitchedOff, Unplugged
 from hw.devices.omicron import OmicronLaser
 from hw.interface import gate_open
+from hw.rig.rig_rules import load_rig_file
 from hw.rig.serial_rig import SerialRig
 from hw.serial.bytelog import ByteLog
 from pipeline.capture.loop import capture
@@ -104,17 +103,20 @@ def test_no_script_lights_a_laser_that_was_not_armed(make: str, tmp_path: Path) 
         line.receive = said.append  # type: ignore[method-assign]
     model = emulated.serial_rig()
     if make == "serial":
-        rig = SerialRig(model._connect, emulated.wiring(), emulated.bench.cameras, emulated.clock, armed=False)
+        rig = SerialRig(model._connector, emulated.bench.cameras, armed=False)
         with pytest.raises(Refused, match=r"not armed.*Remedy.*--arm"):
             capture(rig, PLAN, tmp_path)
         assert said == [] and not rig.connected
         return
     (tmp_path / "rig.toml").write_text(rig_file_of(RIG, {"laser1": "/dev/ttyNOBODY"}))
     file = load_rig_file(tmp_path / "rig.toml")
-    with assembled(file, RIG, TwinRig(RIG, Glow(), seed=5), armed=False) as rig, pytest.raises(Refused, match="--arm"):
+    with (
+        open_scene_rig(file, RIG, TwinRig(RIG, Glow(), seed=5), armed=False) as rig,
+        pytest.raises(Refused, match="--arm"),
+    ):
         rig.__enter__()
     with (
-        assembled(file, RIG, TwinRig(RIG, Glow(), seed=5), armed=True) as rig,
+        open_scene_rig(file, RIG, TwinRig(RIG, Glow(), seed=5), armed=True) as rig,
         pytest.raises(Unplugged, match="NOBODY"),
     ):
         rig.__enter__()
@@ -123,9 +125,21 @@ def test_no_script_lights_a_laser_that_was_not_armed(make: str, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("counts", "limits", "says"),
     [
-        (1023, (0.1, 5.0), r"gives 20.00 mW at the photodiode instead of 10 mW \(the converter is at its top\)"),
-        (768, (0.1, 1.5), r"gives 15.01 mW at the photodiode instead of 10 mW\. Remedy"),
-        (51, (0.1, 1.5), r"gives 1.00 mW at the photodiode instead of 10 mW\. Remedy"),
+        (
+            1023,
+            (0.1, 5.0),
+            r"gives 20.00 mW \(1023 counts\) .* instead of 10 mW \(the converter is at its top\)",
+        ),
+        (
+            768,
+            (0.1, 1.5),
+            r"gives 15.01 mW \(768 counts\) .* instead of 10 mW \(allowed: 1 to 15 mW\)\. Remedy",
+        ),
+        (
+            51,
+            (0.1, 1.5),
+            r"gives 1.00 mW \(51 counts\) .* instead of 10 mW \(allowed: 1 to 15 mW\)\. Remedy",
+        ),
         (767, (0.1, 1.5), None),
         (52, (0.1, 1.5), None),
     ],
@@ -133,11 +147,12 @@ def test_no_script_lights_a_laser_that_was_not_armed(make: str, tmp_path: Path) 
 def test_the_photodiodes_limits(counts: int, limits: tuple[float, float], says: str | None) -> None:
     emulated = emulation()
     rig = emulated.serial_rig()
-    rig.wiring = tuple(replace(wiring, limits=limits) for wiring in rig.wiring)
+    lasers = tuple(laser.model_copy(update={"photodiode_limits": limits}) for laser in rig.file.lasers)
+    rig.file = rig.file.model_copy(update={"lasers": lasers})
     with rig, gate_open(rig.lasers[1]):
         emulated.bench.board.sample = lambda pin: counts if pin == 1 else 0
         if says is None:
-            assert rig.photodiode.read() == counts * rig.wiring[1].watts_per_count
+            assert rig.photodiode.read() == counts * rig.file.lasers[1].watts_per_count
             return
         with pytest.raises(DeviceFault, match=says):
             rig.photodiode.read()
@@ -148,7 +163,7 @@ def test_the_photodiode_is_compared_with_the_set_point() -> None:
     with emulated.serial_rig() as rig, gate_open(rig.lasers[0]):
         rig.cameras[0].expose()
         emulated.bench.heads[0].set_interlock(closed=False)
-        with pytest.raises(DeviceFault, match=r"gives 0.00 mW at the photodiode instead of 10 mW"):
+        with pytest.raises(DeviceFault, match=r"gives 0.00 mW \(0 counts\) at the photodiode instead of 10 mW"):
             rig.photodiode.read()
 
 
@@ -225,12 +240,12 @@ def test_no_gate_opens_and_no_image_counts_without_a_guard() -> None:
         raise SwitchedOff("guard://laser2", "the port of laser 476 nm", "is closed: its guard ended", "none")
 
     with emulated.serial_rig() as rig:
-        rig.devices().heads[2].require_guard = gone  # type: ignore[method-assign]
+        rig.drivers().lasers[2].require_guard = gone  # type: ignore[method-assign]
         with pytest.raises(SwitchedOff, match="its guard ended"):
             rig.lasers[0].open_gate()
         assert not emulated.bench.board.lines & 7
     with emulated.serial_rig() as rig, pytest.raises(SwitchedOff), gate_open(rig.lasers[0]):  # noqa: PT012 - a gate block
-        rig.devices().heads[2].require_guard = gone  # type: ignore[method-assign]
+        rig.drivers().lasers[2].require_guard = gone  # type: ignore[method-assign]
         rig.photodiode.read()
     assert emulated.bench.light() == [] and emulated.bench.hazards == []
 
@@ -239,7 +254,7 @@ def test_no_gate_opens_before_the_rig_is_entered_anew_when_the_light_was_cut() -
     """The lasers were told off: their gates would let out nothing, or what a laser that did not hear still emits."""
     emulated = emulation()
     with emulated.serial_rig() as rig:
-        rig.cut()
+        rig.darken()
         with pytest.raises(
             DeviceFault, match=r"lost an answer while a gate was open: the lasers were switched off.*Remedy"
         ):
@@ -271,21 +286,21 @@ def test_no_failure_of_a_step_keeps_the_rig_from_being_made_safe() -> None:
     emulated = emulation()
     rig = emulated.serial_rig()
     rig.__enter__()
-    rig.devices().board.shut_now = full  # type: ignore[method-assign]
-    rig.cut()  # says so, and goes on to the lasers
+    rig.drivers().board.darken = full  # type: ignore[method-assign]
+    rig.darken()  # says so, and goes on to the lasers
     assert not any(head.on_since for head in emulated.bench.heads)
     rig.make_safe()
     assert emulated.bench.board.lines == 0 and not rig.connected
 
 
-@pytest.mark.parametrize("step", ["off_now", "board", "head", "table"])
+@pytest.mark.parametrize("step", ["darken", "board", "head", "table"])
 def test_ctrl_c_while_the_rig_is_made_safe_leaves_no_device_open(step: str) -> None:
     """It is heard in the end; every device is closed before. Called again, nothing is left."""
     emulated = emulation()
     rig = emulated.serial_rig()
     rig.__enter__()
-    devices, closed = rig.devices(), []
-    parts = {"head": devices.heads[0], "board": devices.board, "table": devices.table}
+    devices, closed = rig.drivers(), []
+    parts = {"head": devices.lasers[0], "board": devices.board, "table": devices.table}
     for name, part in parts.items():
         close = part.close
 
@@ -298,15 +313,15 @@ def test_ctrl_c_while_the_rig_is_made_safe_leaves_no_device_open(step: str) -> N
 
         setattr(part, "close", spied)  # noqa: B010 - a spy on one device
     pressed: list[str] = []
-    off_now = devices.heads[0].off_now
+    darken = devices.lasers[0].darken
 
     def off_spied() -> None:
-        if step == "off_now" and not pressed:
+        if step == "darken" and not pressed:
             pressed.append(step)
             signal.raise_signal(signal.SIGINT)
-        off_now()
+        darken()
 
-    setattr(devices.heads[0], "off_now", off_spied)  # noqa: B010 - the same
+    setattr(devices.lasers[0], "darken", off_spied)  # noqa: B010 - the same
     with pytest.raises(KeyboardInterrupt):
         rig.make_safe()
     assert sorted(closed) == ["board", "head", "table"]
@@ -318,7 +333,7 @@ def test_ctrl_c_while_the_rig_is_made_safe_leaves_no_device_open(step: str) -> N
 def test_a_guard_that_ends_while_lasers_warm_up_ends_it_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     emulated = emulation()
     rig = emulated.serial_rig()
-    rig._warm_up_s = 3600.0
+    rig.file = rig.file.model_copy(update={"warm_up_s": 3600.0})
     begun = emulated.clock.now()
 
     def require_guard(self: OmicronLaser) -> None:
@@ -337,12 +352,12 @@ def test_what_interrupts_one_step_though_signals_wait_leaves_no_other_device_ope
     emulated = emulation()
     rig = emulated.serial_rig()
     rig.__enter__()
-    devices = rig.devices()
+    devices = rig.drivers()
 
     def ended() -> None:
         raise SystemExit
 
-    devices.heads[0].off_now = ended  # type: ignore[method-assign]
+    devices.lasers[0].darken = ended  # type: ignore[method-assign]
     with pytest.raises(SystemExit):
         rig.make_safe()
     assert emulated.bench.board.lines == 0 and not any(head.on_since for head in emulated.bench.heads)

@@ -14,10 +14,10 @@ from guard_fakes import guards_of
 from rig_fakes import emulation
 from rig_programs import GATE, Bench, devices, started
 
-from disco_twin.emulation.connect import Connector
-from disco_twin.emulation.rig_rules import load_rig_file
-from disco_twin.emulation.selftest import selftest
 from hw.devices.omicron import OmicronLaser
+from hw.rig.connect import Connector
+from hw.rig.rig_rules import load_rig_file
+from hw.rig.selftest import selftest
 from hw.safety.signals import interruptible
 
 __all__ = ["devices"]
@@ -121,7 +121,7 @@ def test_a_signal_that_python_lost_ends_the_warm_up(monkeypatch: pytest.MonkeyPa
 
     emulated = emulation()
     rig = emulated.serial_rig()
-    rig._warm_up_s = 3600.0
+    rig.file = rig.file.model_copy(update={"warm_up_s": 3600.0})
     begun, emit = emulated.clock.now(), OmicronLaser.emit
     monkeypatch.setattr(OmicronLaser, "emit", lambda head: (emit(head), Lost())[0])
     with interruptible(), pytest.raises(KeyboardInterrupt), rig:

@@ -15,7 +15,7 @@ from rig_fakes import SCENE, quick
 from rig_programs import ONE, PROGRAM, at_pattern
 
 from disco_twin.emulation.bench import LAMP_LINE
-from disco_twin.emulation.selftest import rig_file_of
+from disco_twin.emulation.rig_file_of import rig_file_of
 from disco_twin.emulation.serve import Server
 from hw.base.clock import WallClock
 from hw.base.errors import Unplugged

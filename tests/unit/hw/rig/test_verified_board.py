@@ -10,11 +10,11 @@ import pytest
 from rig_fakes import at_message, emulation, reset
 from twin_fakes import RIG
 
-from disco_twin.emulation.connect import keys_named
-from disco_twin.emulation.rig_rules import load_rig_file
-from disco_twin.emulation.selftest import rig_file_of
+from disco_twin.emulation.rig_file_of import rig_file_of
 from hw.base.clock import VirtualClock
 from hw.base.errors import DeviceFault, DeviceRefused, Refused, SwitchedOff
+from hw.rig.connect import keys_named
+from hw.rig.rig_rules import load_rig_file
 from hw.rig.verified_board import VerifiedBoard
 
 
@@ -41,7 +41,7 @@ class FakeBoard:
     def lines(self) -> int:
         return self.pattern
 
-    def shut_now(self) -> None:
+    def darken(self) -> None:
         self.told.append("shut now")
 
     def shut(self) -> None:
@@ -160,7 +160,7 @@ def test_a_reset_behind_any_slow_answer_makes_the_mirrors_be_aimed_anew() -> Non
 def test_a_gate_that_may_be_open_counts_as_open() -> None:
     emulated = emulation()
     with emulated.serial_rig() as rig:
-        board = rig.devices().board
+        board = rig.drivers().board
         refuse, works = DeviceRefused("board", "the mirror board", "does not follow", "none"), board.set_lines
 
         def refused(pattern: int) -> None:

@@ -1,8 +1,8 @@
 """The rig file: which device hangs on which port, what is wired to what, and the limits of every axis.
 
-The scene says what the rig is (geometry, wavelengths, exposures that the pipeline is told); the rig file says which
-hardware makes it so; `rig_rules` reads it and says what is possible. `port = "emulated"` puts an emulated device in the
-place of a real one, a camera of the kind `simulated` sees what the emulated and real devices light: any mixture works.
+The scene describes the rig (geometry, wavelengths); the rig file names the hardware; `hw.rig.rig_rules` reads it and
+checks it. `port = "emulated"` puts an emulated device in the place of a real one, and a camera of the kind `simulated`
+sees what the emulated and real devices light: any mixture works.
 """
 
 from __future__ import annotations
@@ -14,15 +14,17 @@ from pydantic import Field, PrivateAttr
 
 from hw.base.config import Strict, load_toml
 from hw.camera.bracket import Bracket
+from hw.devices.mm_ard import LINES, PINS, STEPS
 from hw.record import Sensor
 
 EMULATED = "emulated"
 RIG_FILE = "a rig file (docs/lab.md, section 3, shows one; `disco-twin rig emulate` writes one)"
-PROJECTOR_STEPS = 4096  # of the board's 12-bit converters
+PROJECTOR_STEPS = STEPS  # of the board's converters
+DARK_COUNTS = 8  # of the photodiode's 1023, with every gate shut
 
 Positive = Annotated[float, Field(gt=0)]
 Response = Annotated[float, Field(ge=1, le=1e24)]
-Line = Annotated[int, Field(ge=0, le=5)]
+TtlLine = Annotated[int, Field(ge=0, le=LINES - 1)]
 Step = Annotated[int, Field(ge=0, lt=PROJECTOR_STEPS)]
 PRINTABLE = r"^[^\x00-\x1f\x7f]*$"  # no control characters
 Port = Annotated[
@@ -57,10 +59,15 @@ class LaserDevice(Strict):
     wavelength_nm: Annotated[float, Field(ge=300, le=1100)]
     power_mw: Annotated[float, Field(gt=0, le=500)]
     baud: Literal[57600, 500000] = 500000
-    gate_line: Line  # the board's TTL line that opens the gate
-    photodiode_pin: Line
+    gate_line: TtlLine  # the board's TTL line that opens the gate
+    photodiode_pin: Annotated[int, Field(ge=0, le=PINS - 1)]
     watts_per_count: Positive  # of laser power on the object, per count of the photodiode
     photodiode_limits: tuple[Positive, Positive] = (0.5, 1.5)  # shares of the power; outside, the image is refused
+
+    @property
+    def title(self) -> str:
+        """What errors call it."""
+        return f"laser {self.wavelength_nm:g} nm"
 
 
 class BoardDevice(Strict):
@@ -68,14 +75,14 @@ class BoardDevice(Strict):
 
     kind: Literal["mm-ard"]
     port: Port
-    floodlight_line: Line
+    floodlight_line: TtlLine
     limits_u: tuple[Step, Step] = (0, PROJECTOR_STEPS - 1)
     limits_v: tuple[Step, Step] = (0, PROJECTOR_STEPS - 1)
     centre: tuple[Step, Step] = (PROJECTOR_STEPS // 2, PROJECTOR_STEPS // 2)  # where the mirrors stand at first
 
 
-class Turning(Strict):
-    """An axis: the table's own angle is `zero_deg + direction * angle of the rig`."""
+class Axis(Strict):
+    """A turntable: its own angle is `zero_deg + direction * angle of the rig`."""
 
     port: Port
     zero_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
@@ -83,7 +90,7 @@ class Turning(Strict):
     reach_s: Annotated[float, Field(gt=0, le=600)] = 20.0  # a move that takes longer has failed
 
 
-class ZaberDevice(Turning):
+class ZaberDevice(Axis):
     """A Zaber rotary stage, ASCII protocol."""
 
     kind: Literal["zaber"]
@@ -92,7 +99,7 @@ class ZaberDevice(Turning):
     axis: Annotated[int, Field(ge=1, le=9)] = 1
 
 
-class ElliptecDevice(Turning):
+class ElliptecDevice(Axis):
     """A Thorlabs ELL14 or ELL18."""
 
     kind: Literal["elliptec"]
@@ -157,7 +164,7 @@ class MeterDevice(Strict):
     port: Port
 
 
-class DevicesFile(Strict):
+class RigFile(Strict):
     """Every device of a rig."""
 
     format_version: Literal[1]
@@ -179,9 +186,18 @@ class DevicesFile(Strict):
         """The file itself, for messages."""
         return self._path
 
+    @property
+    def lamp_line(self) -> int:
+        """The warning lamp's TTL line: the highest that nothing else uses (at most four others are in use)."""
+        used = {laser.gate_line for laser in self.lasers} | {self.board.floodlight_line}
+        return max(line for line in range(LINES) if line not in used)
+
     @classmethod
-    def load(cls, path: Path) -> DevicesFile:
-        """Read a file; what its keys say of each other is `disco_twin.emulation.rig_rules`' business."""
+    def load(cls, path: Path) -> RigFile:
+        """Read a file; `hw.rig.rig_rules` then compares its keys with each other.
+
+        Raises: InputError for what is no rig file.
+        """
         rig = load_toml(path, cls, RIG_FILE, {"object": "a scene", "rig": "a scene"})
         rig._path = path
         return rig

@@ -1,0 +1,300 @@
+"""`disco-twin rig probe | selftest`: which devices are on the ports, and whether they work."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from hw.base.clock import Clock
+from hw.base.errors import DeviceFault, DiscoError, InputError
+from hw.devices.omicron import OmicronLaser
+from hw.devices.ophir import OphirMeter
+from hw.rig.connect import Connector, open_camera, require_black
+from hw.rig.drivers import Board, Closable, darken
+from hw.rig.emission import begin_emission, require_darkness, require_light
+from hw.rig.rig_file import EMULATED, GenicamDevice, LaserDevice, RigFile
+from hw.rig.verified_board import VerifiedBoard
+
+log = logging.getLogger(__name__)
+
+Shapes = Mapping[str, tuple[int, int]]
+
+TEST_ANGLE_DEG = 30.0
+ANGLE_TOLERANCE_DEG = 0.05
+FRAMES = 20
+
+
+@dataclass(frozen=True)
+class DeviceFinding:
+    """One line of a probe or self-test."""
+
+    name: str
+    good: bool
+    text: str
+
+    def __str__(self) -> str:
+        return f"{'ok  ' if self.good else 'FAIL'}  {self.name:<22} {self.text}"
+
+
+def _try(name: str, check: Callable[[], str]) -> DeviceFinding:
+    try:
+        return DeviceFinding(name, True, check())
+    except DiscoError as error:
+        return DeviceFinding(name, False, str(error))
+
+
+C = TypeVar("C", bound=Closable)
+
+
+@contextmanager
+def _then(end: Callable[[], None]) -> Iterator[None]:
+    """Something, and then this, whatever happened. What fails in it never takes the place of what went wrong before.
+
+    At Ctrl-C a laser's guard is faster than we are, and closing fails: that must not look like a test that failed,
+    after which the next laser would be tried.
+    """
+    try:
+        yield
+    except BaseException:
+        try:
+            end()
+        except DiscoError as error:
+            log.info("closing: %s", error)
+        raise
+    end()
+
+
+@contextmanager
+def _using(device: C) -> Iterator[C]:
+    """The device, closed at the end."""
+    with _then(device.close):
+        yield device
+
+
+@contextmanager
+def _light(clock: Clock, board: Board, laser: OmicronLaser) -> Iterator[Callable[[], None]]:
+    """A laser and its gate; yields the way to tell both to go dark, as they are at once when anything goes wrong.
+
+    In the end the laser is closed first, which one that does not answer draws out for seconds, then the lines are shut.
+    """
+
+    def go_dark() -> None:
+        darken(clock, board, [laser])
+
+    def shut() -> None:
+        board.when_lost(lambda: None)  # the laser that would be told is closed by now
+        board.shut()
+
+    with _then(shut), _using(laser):
+        try:
+            yield go_dark
+        except BaseException:
+            go_dark()
+            raise
+
+
+def _cameras(file: RigFile, shapes: Shapes | None) -> list[tuple[GenicamDevice, tuple[int, int]]]:
+    """The GenICam cameras and their (height, width)."""
+    cameras = [camera for camera in file.cameras if isinstance(camera, GenicamDevice)]
+    if cameras and shapes is None:
+        raise InputError("GenICam cameras need the scene, which has their size", remedy="add --scene SCENE")
+    return [(camera, (shapes or {})[camera.name]) for camera in cameras]
+
+
+def probe(file: RigFile, shapes: Shapes | None, logs: Path | None = None) -> Generator[DeviceFinding, None, None]:
+    """Connect to every real device and let it identify itself. Lasers are switched off and gates shut by that.
+
+    shapes: (height, width) of every camera by its name; needed for GenICam cameras alone
+    """
+    connect = Connector(file, logs=logs)
+
+    def identified(index: int) -> str:
+        with _using(connect.omicron(index)) as laser:
+            found, mw = laser.identity, laser.require_off()
+        kind = f"{found.model} {found.wavelength_nm:g} nm, {found.max_power_mw:g} mW"
+        return f"{kind}, no. {found.serial_number}; off ({mw:.2f} mW)"
+
+    def board() -> str:
+        with _using(connect.board()):
+            return "MM-Ard; every line low"
+
+    def table() -> str:
+        with _using(connect.table()) as driver:
+            return f"{file.turntable.kind}, at {np.rad2deg(driver.angle_rad()):.2f} deg"
+
+    for index, device in enumerate(file.lasers):
+        if device.port != EMULATED:
+            yield _try(device.title, partial(identified, index))
+    if file.board.port != EMULATED:
+        yield _try("mirror board", board)
+    if file.turntable.port != EMULATED:
+        yield _try("turntable", table)
+    if file.power_meter is not None and file.power_meter.port != EMULATED:
+        yield _try("power meter", partial(_meter_reads, connect))
+    for device_, shape in _cameras(file, shapes):
+        yield _try(f"camera {device_.name}", partial(_camera_identity, file, device_, shape))
+
+
+def _meter_reads(connect: Connector) -> str:
+    with _using(connect.meter()) as meter:
+        return f"reads {1e3 * meter.read():.3f} mW"
+
+
+@contextmanager
+def _metering(connect: Connector) -> Iterator[OphirMeter | None]:
+    """The real power meter, where there is one: found before a laser emits, since that takes seconds."""
+    device = connect.file.power_meter
+    if device is None or device.port == EMULATED:
+        yield None
+    else:
+        with _using(connect.meter()) as meter:
+            yield meter
+
+
+def _camera_identity(file: RigFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
+    assert file.sensor is not None
+    with _using(open_camera(file, device, shape)) as camera:
+        return camera.grabber.identity()
+
+
+def selftest(
+    file: RigFile, shapes: Shapes | None, armed: bool, logs: Path | None = None
+) -> Generator[DeviceFinding, None, None]:
+    """Exercise every real device. Lasers emit, one behind an open gate at a time, only if `armed`."""
+    connect = Connector(file, logs=logs)
+    lasers = {laser.title: i for i, laser in enumerate(file.lasers) if laser.port != EMULATED}
+    off = [_try(f"{name}, off", partial(_test_off, connect, index)) for name, index in lasers.items()]
+    yield from off
+    board = None
+    if file.board.port != EMULATED:
+        try:
+            board = connect.board()  # shuts the gates, whatever the lasers said
+        except DiscoError as error:
+            yield DeviceFinding("mirror board", False, str(error))
+            return
+    try:
+        if not all(finding.good for finding in off):  # what may be lit is neither let out nor moved about in
+            yield DeviceFinding("gates", False, "left shut, and nothing moved: a laser did not say that it is off")
+            return
+        if file.turntable.port != EMULATED:
+            yield _try("turntable", lambda: _test_table(connect))
+        for device, shape in _cameras(file, shapes):
+            yield _try(f"camera {device.name}", partial(_test_camera, file, device, shape))
+        if board is not None:
+            yield from _test_light(connect, board, lasers if armed else {})
+    finally:
+        if board is not None:
+            try:
+                board.close()
+            except DiscoError as error:
+                log.warning("%s", error)
+
+
+def _test_light(connect: Connector, board: Board, lasers: Mapping[str, int]) -> Iterator[DeviceFinding]:
+    """Mirrors, gates and photodiodes of a dark rig; then each of these lasers (name -> index)."""
+    file = connect.file
+    yield _try("mirrors", lambda: _test_mirrors(file, board))
+    yield _try("gates", lambda: _test_lines(file, board))
+    yield _try("photodiode, dark", lambda: _test_dark(file, board))
+    for name, index in lasers.items():
+        yield _try(name, partial(_test_laser, connect, board, index))
+
+
+def _test_table(connect: Connector) -> str:
+    with _using(connect.table()) as table:
+        table.home()
+        for angle in (TEST_ANGLE_DEG, 0.0):
+            table.move(float(np.deg2rad(angle)))
+            off = (np.rad2deg(table.angle_rad()) - angle + 180.0) % 360.0 - 180.0
+            if abs(off) > ANGLE_TOLERANCE_DEG:
+                problem = (
+                    f"says that it stands {off:+.3f} deg from {angle:g} deg (allowed: {ANGLE_TOLERANCE_DEG:g} off)"
+                )
+                raise DeviceFault(table.link.url, "turntable", problem, "check microsteps_per_deg in the rig file")
+        return f"homed, turned to {TEST_ANGLE_DEG:g} deg and back"
+
+
+def _test_camera(file: RigFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
+    assert file.sensor is not None
+    with _using(open_camera(file, device, shape)) as camera:
+        black = require_black(camera, file.sensor)
+        for _ in range(FRAMES):
+            camera.expose()
+        return f"{FRAMES} brackets, {camera.lost} frames taken again, black level {black:.1f} DN"
+
+
+def _test_mirrors(file: RigFile, board: Board) -> str:
+    for u in file.board.limits_u:
+        for v in file.board.limits_v:
+            board.set_mirrors(u, v)
+    board.set_mirrors(*file.board.centre)
+    return "took every corner of their limits (look whether they moved)"
+
+
+def _test_lines(file: RigFile, board: Board) -> str:
+    lines = [laser.gate_line for laser in file.lasers] + [file.board.floodlight_line, file.lamp_line]
+    for line in lines:
+        board.set_lines(1 << line)
+        board.set_lines(0)
+    return f"lines {', '.join(map(str, lines))} high and low one by one, read back"
+
+
+def _test_dark(file: RigFile, board: Board) -> str:
+    remedy = "shade it, or correct its amplifier's offset"
+    read = [
+        require_darkness(board.counts(laser.photodiode_pin), laser, "with every gate shut", remedy)
+        for laser in file.lasers
+    ]
+    return f"{', '.join(map(str, read))} counts"
+
+
+def _test_off(connect: Connector, index: int) -> str:
+    with _using(connect.omicron(index)) as laser:
+        return f"{laser.require_off():.2f} mW while off"
+
+
+def _test_laser(connect: Connector, board: Board, index: int) -> str:
+    """Emission behind its shut gate, then through it, against the set point; then off, gate open, against darkness.
+
+    The gate is shut whenever a laser that is on is asked for something: one that falls silent is asked for seconds.
+    """
+    file, device = connect.file, connect.file.lasers[index]
+    with _metering(connect) as meter, _light(connect.clock, board, laser := connect.omicron(index)) as go_dark:
+        verified = VerifiedBoard(board, connect.clock, [entry.gate_line for entry in file.lasers], go_dark)
+        verified.require_lines()
+        verified.aim(*file.board.centre)
+        (reading,) = begin_emission(connect.clock, file, verified, {index: laser})
+        verified.require_lines()
+        laser.require_guard()
+        verified.open_gate(device.gate_line)
+        counts, own_mw = _counts(verified, device), 1e3 * reading.own_w
+        read_mw = 1e3 * require_light(counts, device, own_mw)
+        metered = "" if meter is None else _compared(meter.read(), counts)
+        verified.switch(device.gate_line, False)
+        laser.stop_emission()
+        laser.require_off()
+        verified.open_gate(device.gate_line)
+        require_darkness(_counts(verified, device), device, "while it is off", "check the wiring of gate and interlock")
+        return (
+            f"set {device.power_mw:g} mW, own reading {own_mw:.2f} mW, photodiode {read_mw:.2f} mW ({counts} counts)"
+            f"{metered}; off again"
+        )
+
+
+def _counts(board: VerifiedBoard, device: LaserDevice) -> int:
+    """What the laser's photodiode reads, gates and mirrors being where they should be."""
+    counts = board.counts(device.photodiode_pin)
+    board.require_lines()
+    return counts
+
+
+def _compared(watts: float, counts: int) -> str:
+    """The power meter's reading, and the watts_per_count that it asks for."""
+    return f", power meter {1e3 * watts:.2f} mW: watts_per_count = {watts / max(counts, 1):.4g}"
