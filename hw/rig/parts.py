@@ -82,7 +82,7 @@ class AdcPhotodiode:
         device = self.rig.file.lasers[laser]
         counts = board.counts(device.photodiode_pin)
         if self.rig.open_gate == laser:
-            return require_light(counts, device, self.rig.own_mw[laser])
+            return require_light(counts, device)
         return counts * device.watts_per_count
 
 

@@ -18,7 +18,7 @@ from hw.base.clock import Elapsed, Timebase
 from hw.base.errors import InputError, Refused
 from hw.interface import Aim, Camera, Floodlight, Laser, LaserReading, Photodiode, Projector, Turntable
 from hw.rig.connect import Connector, StandIns, keys_named, open_camera, require_black
-from hw.rig.drivers import Drivers, LaserDriver
+from hw.rig.drivers import Drivers
 from hw.rig.emission import begin_emission, check_lasers
 from hw.rig.parts import AdcPhotodiode, GatedLaser, Mirrors, SafeTurntable, TtlFloodlight
 from hw.rig.rig_file import GenicamDevice, RigFile
@@ -46,7 +46,6 @@ class SerialRig:
         self._timebase: Timebase = Elapsed(self.clock) if stand_ins.timebase is None else stand_ins.timebase
         self._drivers: Drivers | None = None
         self._board: VerifiedBoard | None = None
-        self.own_mw = [0.0] * len(self.file.lasers)  # the lasers' own readings when they were checked last
         self.last_open = -1  # the laser whose gate was opened last: whose photodiode is to be read
         self.lasers: Sequence[Laser] = [GatedLaser(self, i) for i in range(len(self.file.lasers))]
         self.projector: Projector = Mirrors(self)
@@ -74,7 +73,7 @@ class SerialRig:
             self._in_the_dark()
             board.aim(*self.file.board.centre)
             drivers.table.home()
-            self._checked(begin_emission(self.clock, self.file, board, self._numbered()))
+            begin_emission(self.clock, self.file, board, dict(enumerate(drivers.lasers)))
         except BaseException:
             self.make_safe()
             raise
@@ -158,14 +157,7 @@ class SerialRig:
         """
         if self.open_gate >= 0:
             raise Refused(f"the lasers are checked in the dark, and the gate of laser {self.open_gate} is open")
-        return self._checked(check_lasers(self.file, self.board(), self._numbered()))
-
-    def _numbered(self) -> Mapping[int, LaserDriver]:
-        return dict(enumerate(self.drivers().lasers))
-
-    def _checked(self, readings: Sequence[LaserReading]) -> Sequence[LaserReading]:
-        self.own_mw = [1e3 * reading.own_w for reading in readings]
-        return readings
+        return check_lasers(self.file, self.board(), dict(enumerate(self.drivers().lasers)))
 
     @property
     def open_gate(self) -> int:

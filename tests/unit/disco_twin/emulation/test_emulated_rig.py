@@ -106,9 +106,7 @@ def test_a_laser_that_goes_out_is_noticed_at_the_photodiode() -> None:
         rig.lasers[2].open_gate()
         rig.cameras[0].expose()
         emulated.bench.heads[2].set_interlock(closed=False)
-        with pytest.raises(
-            DeviceFault, match=r"laser 476 nm gives 0\.00 mW \(0 counts\) at the photodiode"
-        ):
+        with pytest.raises(DeviceFault, match=r"laser 476 nm gives 0\.00 mW \(0 counts\) at the photodiode"):
             rig.photodiode.read()
 
 

@@ -187,7 +187,7 @@ def weaker(twin: TwinRig, laser: int, share: float) -> None:
     [
         (0.75, r"since image 5: laser power of view 0, spot 1, laser 1: 2\.\d+ mW, was 3\.\d+ mW \(allowed: 20 %\)"),
         (1.3, r"since image 5: laser power of view 0, spot 1, laser 1: 5\.\d+ mW, was 3\.\d+ mW \(allowed: 20 %\)"),
-        (0.05, r"laser 532 nm gives 0\.\d+ mW at the photodiode instead of 10 mW.*Remedy"),
+        (0.05, r"laser 532 nm gives 0\.\d+ mW .* at the photodiode instead of 10 mW.*Remedy"),
         (0.9, None),
     ],
 )
