@@ -76,8 +76,8 @@ def emulate(
 
 def _loaded(path: Path, scene: Path | None, logs: Path | None) -> tuple[RigFile, dict[str, tuple[int, int]] | None]:
     """The rig file, and the sizes of the cameras of the scene that goes with it."""
-    from disco_twin.experiment.run_folder import require_folder
     from disco_twin.scene.scene import load_scene
+    from hw.base.files import require_folder
     from hw.rig.rig_rules import load_rig_file
     from pipeline.capture.rig_fits_scene import require_scene
 

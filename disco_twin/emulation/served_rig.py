@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_twin.emulation.rig_file_of import rig_file_of
-from disco_twin.experiment.run_folder import require_folder
 from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.clock import WallClock
 from hw.base.errors import DiscoError, InputError
-from hw.base.files import take_lock, write_atomically
+from hw.base.files import require_folder, take_lock, write_atomically
 from hw.interface import Aim
 
 if TYPE_CHECKING:

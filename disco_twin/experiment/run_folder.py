@@ -11,7 +11,6 @@ import hashlib
 import json
 import logging
 import os
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -28,20 +27,6 @@ log = logging.getLogger(__name__)
 
 FORMAT_VERSION = 2
 FOLDERS = ("capture", "twin", "work")
-
-
-def require_folder(folder: Path, option: str) -> None:
-    """Make the folder that an option names, and see that it can be written to."""
-    remedy = f"choose another {option}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return
-    except (FileExistsError, NotADirectoryError) as error:
-        raise InputError("a file is in its place", file=folder, key=option, remedy=remedy) from error
-    except OSError as error:
-        problem = f"cannot be written to ({(error.strerror or str(error)).lower()})"
-        raise InputError(problem, file=folder, key=option, remedy=remedy) from error
 
 
 @dataclass

@@ -9,9 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from disco_twin.experiment.run_folder import content_key, require_folder
+from disco_twin.experiment.run_folder import content_key
 from hw.base.errors import InputError, naming
-from hw.base.files import write_atomically
+from hw.base.files import require_folder, write_atomically
 from hw.rig.rig_file import EMULATED, RigFile
 from hw.rig.rig_rules import load_rig_file
 from pipeline.capture.loop import capture

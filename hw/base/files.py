@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Collection, Iterator, Mapping
@@ -100,3 +101,17 @@ def take_lock(handle: int) -> bool:
     except BlockingIOError:
         return False
     return True
+
+
+def require_folder(folder: Path, option: str) -> None:
+    """Make the folder that an option names. Raises: InputError where it cannot be made or written to."""
+    remedy = f"choose another {option}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return
+    except (FileExistsError, NotADirectoryError) as error:
+        raise InputError("a file is in its place", file=folder, key=option, remedy=remedy) from error
+    except OSError as error:
+        problem = f"cannot be written to ({(error.strerror or str(error)).lower()})"
+        raise InputError(problem, file=folder, key=option, remedy=remedy) from error
