@@ -305,7 +305,7 @@ def test_clear_inside(sigma_t: float) -> None:
 
 
 def test_optical_thickness_of_ten_thousand() -> None:
-    """A half-space again: 1000 mean free paths a millimetre must reflect like 10 (exact values of validation.md)."""
+    """A half-space again: 1000 mean free paths a millimetre must reflect like 10 (exact values, `half_spaces`)."""
     for kind, n, exact in (("matched", 1.0, (0.414947, 0.752721)), ("smooth", 1.5, (0.219919, 0.561981))):
         transport = Transport(twin(block(20.0, 10.0), kind, n, 1000.0, [0.9, 0.99]))  # type: ignore[arg-type]
         power, traced = escaped(transport, beam(REPLICATES), REPLICATES, 10_000, seed=56)

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
-from tests.validation.significance import assert_z, z_of_replicates
+from significance import assert_z, z_of_replicates
 
 from disco_twin.light.sampling import Rng
 from disco_twin.light.sources import light_source

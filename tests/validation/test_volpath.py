@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
-from tests.validation.significance import assert_z, z_of_difference
+from significance import assert_z, z_of_difference
 
 from benchmarks.volpath import volpath_scene
 from disco_twin.light.references import render_reference

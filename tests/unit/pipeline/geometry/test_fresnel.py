@@ -48,5 +48,5 @@ def test_hemispherical_mean(eta: float) -> None:
 
 
 def test_published_mean() -> None:
-    assert mean_transmittance(1.3) == pytest.approx(0.939, abs=5e-4)  # design.md
+    assert mean_transmittance(1.3) == pytest.approx(0.939, abs=5e-4)
     assert 1 - mean_transmittance(1.5) == pytest.approx(0.0918, abs=5e-5)  # Egan & Hilgeman 1979
