@@ -75,7 +75,7 @@ def notes(experiment: Experiment) -> list[str]:
 def impulses(rig: RigConfig, capture: Path, sensor: Sensor) -> tuple[list[list[Impulse]], list[str]]:
     """Rows: cameras, columns: spots spread over the turntable angles; at the laser of the longest wavelength.
 
-    A spot with a damaged image is left out; the second list says which image that was.
+    A spot with a damaged image is left out; the second list names that image.
     """
     from pipeline.calibrate.calibration import nominal_calibration
     from pipeline.plan.plan import ImageAddress
