@@ -24,7 +24,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from pydantic import Field
 
 from hw.base.config import Strict, read_json
@@ -38,7 +37,7 @@ from pipeline.calibrate.target_images import has_targets
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import Boundary
 from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
-from pipeline.model.reflectance import ReflectanceModel
+from pipeline.model.relightable import RelightableModel
 from pipeline.plan.targets import FOLDER
 from pipeline.reconstruct.methods import METHODS, READINGS, reconstruct
 from pipeline.reconstruct.omissions import omissions
@@ -46,9 +45,8 @@ from pipeline.reconstruct.samples.image_operators import ImageOperator
 from pipeline.reconstruct.samples.samples import Samples, SampleStatistics, take_samples
 from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.records import RigFile, SensorFile
-from pipeline.relight.irradiance import transmitted_flux
 from pipeline.relight.lights import Light
-from pipeline.relight.view_matrix import ViewMatrix, view_matrix
+from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 from pipeline.stream.stream import StreamReader
 
 FORMAT_VERSION = 1
@@ -141,33 +139,24 @@ def gather(
         return take_samples(stream, calibration, mesh, readings, settings)
 
 
-def relight(models: dict[str, ReflectanceModel], request: Request, work: Path, stages: Stages) -> dict[str, float]:
-    """Relit images of every method, light and view; seconds per method. Methods with one boundary share the rest."""
-    seconds = dict.fromkeys(models, 0.0)
-    prepared: dict[Boundary, tuple[dict[str, NDArray[np.float64]], dict[str, ViewMatrix]]] = {}
+def relight(models: dict[str, RelightableModel], request: Request, work: Path, stages: Stages) -> dict[str, float]:
+    """Relit images of every method, light and view; seconds per method. Models of one mesh and boundary share the rest."""
+    seconds, wanted = dict.fromkeys(models, 0.0), request.relight
+    shared: dict[tuple[int, Boundary], tuple[dict[str, LightOnMesh], dict[str, ViewOfMesh]]] = {}
     for method, model in models.items():
-        start = time.perf_counter()
+        start, surface = time.perf_counter(), (id(model.mesh), model.boundary)
+        if surface not in shared:
+            cameras = {view.name: PinholeCamera.from_config(view) for view in wanted.views}
+            lights = {light.name: model.lit_by(light) for light in wanted.lights}
+            shared[surface] = lights, {name: model.seen_by(camera) for name, camera in cameras.items()}
         with stages.stage(f"relight {method}"):
-            if model.boundary not in prepared:
-                prepared[model.boundary] = prepare(model, request.relight)
-            fluxes, matrices = prepared[model.boundary]
             folder = work / "relit" / method
             folder.mkdir(parents=True, exist_ok=True)
-            for light, flux in fluxes.items():
-                radiosity = model.radiosity(flux)
-                for view, matrix in matrices.items():
-                    np.save(folder / f"{light}@{view}.npy", matrix.image(radiosity))
+            for light, lit in shared[surface][0].items():
+                for view, seen in shared[surface][1].items():
+                    np.save(folder / f"{light}@{view}.npy", model.image(lit, seen))
         seconds[method] = time.perf_counter() - start
     return seconds
-
-
-def prepare(
-    model: ReflectanceModel, wanted: RelightRequest
-) -> tuple[dict[str, NDArray[np.float64]], dict[str, ViewMatrix]]:
-    """Flux (L, V) in W by light and view matrix by view, for the model's mesh and boundary."""
-    mesh, boundary, lasers = model.mesh, model.boundary, len(model.reflectance)
-    fluxes = {light.name: transmitted_flux(light, mesh, boundary, lasers) for light in wanted.lights}
-    return fluxes, {v.name: view_matrix(mesh, PinholeCamera.from_config(v), boundary) for v in wanted.views}
 
 
 def run(capture: Path, work: Path, request: Request, given: Path | None = None) -> dict[str, Any]:
@@ -188,7 +177,7 @@ def run(capture: Path, work: Path, request: Request, given: Path | None = None) 
         shared = samples["footprint"]  # the methods share its distances
         log.info("%d near pairs", len(shared.spot_pairs.first) + len(shared.vertex_pairs.first))
         left_out = omissions(shared, calibration)
-    models: dict[str, ReflectanceModel] = {}
+    models: dict[str, RelightableModel] = {}
     seconds: dict[str, float] = {}
     for name in settings.methods:
         with stages.stage(f"reconstruct {name}"):

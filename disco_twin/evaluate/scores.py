@@ -21,7 +21,7 @@ from hw.base.files import write_json
 
 if TYPE_CHECKING:
     from pipeline.geometry.nominal_rig import CameraConfig
-    from pipeline.model.reflectance import ReflectanceModel
+    from pipeline.model.relightable import RelightableModel
 
 log = logging.getLogger(__name__)
 
@@ -106,17 +106,17 @@ def load_relit(folder: RunFolder, method: str, light: str, view: CameraConfig) -
     return image
 
 
-def load_model(folder: RunFolder, method: str) -> ReflectanceModel | None:
-    """A method's R_d; None for the Lambertian surface, whose light leaves where it enters."""
-    from pipeline.model.reflectance import ReflectanceModel
+def load_model(folder: RunFolder, method: str) -> RelightableModel:
+    """A method's model. Raises: InputError where its file is missing, damaged or of another version."""
+    from pipeline.model.relightable import RelightableModel
 
-    return None if method == "lambertian" else ReflectanceModel.load(folder.work / f"model-{method}.npz")
+    return RelightableModel.load(folder.work / f"model-{method}.npz")
 
 
 def score_models(folder: RunFolder, methods: Sequence[str]) -> dict[str, Any]:
     """By method: log10_rmse of measured and of all entries and the coverage, each by decade below the peak.
 
-    A method whose R_d cannot be scored has None.
+    A method whose R_d cannot be scored has None; one whose model states no R_d is left out.
     """
     from disco_twin.light.truth import Truth
     from pipeline.relight.scores import Unscorable, score_reflectance
@@ -124,13 +124,12 @@ def score_models(folder: RunFolder, methods: Sequence[str]) -> dict[str, Any]:
     truth = Truth.load(folder.twin / "truth.npz")
     out: dict[str, Any] = {}
     for method in methods:
-        model = load_model(folder, method)
-        if model is None:
+        estimate = load_model(folder, method).reflectance_columns(truth.columns)
+        if estimate is None:
             continue
-        estimate, measured = model.reflectance[:, truth.columns], model.measured[truth.columns]
         try:
-            own = score_reflectance(estimate, truth.mean, truth.standard_error, measured)
-            full = score_reflectance(estimate, truth.mean, truth.standard_error, True)
+            own = score_reflectance(estimate.mean, truth.mean, truth.standard_error, estimate.measured)
+            full = score_reflectance(estimate.mean, truth.mean, truth.standard_error, True)
         except Unscorable as why:
             log.warning("no score for the R_d of %s: %s", method, why)
             out[method] = None

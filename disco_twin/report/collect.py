@@ -38,8 +38,8 @@ def collect(experiment: Experiment, folder: RunFolder, summary: dict[str, Any]) 
     shown, damaged = impulses(experiment.scene.rig, folder.capture, sensor)
     models = {}
     for method in methods:
-        if (model := load_model(folder, method)) is not None:
-            models[method] = np.asarray(model.reflectance[:, truth.columns], np.float64)
+        if (columns := load_model(folder, method).reflectance_columns(truth.columns)) is not None:
+            models[method] = np.asarray(columns.mean, np.float64)
     made = load_results(folder)
     launched = truth.balance.launched
     return ReportData(

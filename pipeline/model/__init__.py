@@ -1,1 +1,1 @@
-"""What a reconstruction yields: a relightable model of the object, and its file."""
+"""What a reconstruction yields: a relightable model of the object, a sum of terms, and its file."""

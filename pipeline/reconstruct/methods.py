@@ -1,46 +1,125 @@
-"""The methods by name. A reconstruction is one function from samples to a model; a new one is a new entry here."""
+"""The registry of methods. A method is one function from samples to a model, in one file of this package:
+
+    @method("mine", about="what it does, in one line")
+    def reconstruct_mine(samples: Samples) -> RelightableModel:
+
+The decorators are read from the files without running them, so that a scene's methods can be checked before anything
+heavy is imported; a method's module is imported when it is called.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import ast
+import difflib
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
-import numpy as np
+import pipeline.reconstruct
+from hw.base.errors import InputError
 
-from pipeline.model.reflectance import ReflectanceModel
-from pipeline.reconstruct.baselines.dipole import fit_dipole
-from pipeline.reconstruct.baselines.disco2004 import resample_2004
-from pipeline.reconstruct.baselines.lambertian import fit_lambertian
-from pipeline.reconstruct.global_term.completion import complete
-from pipeline.reconstruct.omissions import colour_groups, is_opaque
-from pipeline.reconstruct.samples.image_operators import bilinear_reading, footprint_reading
-from pipeline.reconstruct.samples.samples import Samples, select_lasers
+if TYPE_CHECKING:
+    from pipeline.model.relightable import RelightableModel
+    from pipeline.reconstruct.samples.samples import Samples
 
-READINGS = {"footprint": footprint_reading, "bilinear": bilinear_reading}
+Function = TypeVar("Function", bound="Callable[[Samples], RelightableModel]")
 
 
 @dataclass(frozen=True)
-class Reconstruction:
-    """solve: samples -> model; reading: how the samples are read from the images."""
+class Method:
+    """name: in scenes, files and reports; about: one line; reads: how vertices are read from images, `footprint` or
+    `bilinear` (`samples.image_operators`); baseline: cheap, and scored in every run; colour: in plots, #rrggbb;
+    module, function: where it is
+    """
 
-    solve: Callable[[Samples], ReflectanceModel]
-    reading: Literal["footprint", "bilinear"] = "footprint"
+    name: str
+    module: str
+    function: str
+    about: str = ""
+    reads: str = "footprint"
+    baseline: bool = False
+    colour: str | None = None
+
+    def __call__(self, samples: Samples) -> RelightableModel:
+        """Run it on what the data need: wavelengths whose samples agree are solved once."""
+        import numpy as np
+
+        from pipeline.reconstruct.omissions import colour_groups
+        from pipeline.reconstruct.samples.samples import select_lasers
+
+        groups = colour_groups(samples)
+        kept = sorted(set(groups))
+        solve = getattr(import_module(self.module), self.function)
+        model = solve(select_lasers(samples, np.array(kept))).of_lasers([kept.index(group) for group in groups])
+        return replace(model, provenance={"method": self.name} | dict(model.provenance))
 
 
-METHODS: Mapping[str, Reconstruction] = {
-    "default": Reconstruction(complete),
-    "disco2004": Reconstruction(resample_2004, "bilinear"),
-    "dipole": Reconstruction(fit_dipole),
-    "lambertian": Reconstruction(fit_lambertian),
-}
+def method(
+    name: str, *, about: str, reads: str = "footprint", baseline: bool = False, colour: str | None = None
+) -> Callable[[Function], Function]:
+    """Register a function as a method (see `Method`). The arguments are written out: `known_methods` reads them."""
+    return lambda function: function
 
 
-def reconstruct(samples: Samples, method: Reconstruction) -> ReflectanceModel:
-    """Run a method on what the data need: equal wavelengths are solved once, an opaque object without global term."""
-    groups = colour_groups(samples)
-    kept = sorted(set(groups))
-    solve = fit_lambertian if method.solve is complete and is_opaque(samples) else method.solve
-    model = solve(select_lasers(samples, np.array(kept)))
-    again = [kept.index(group) for group in groups]
-    return replace(model, reflectance=model.reflectance[again], variance=model.variance[again])
+@cache
+def known_methods() -> Mapping[str, Method]:
+    """All methods of the package by name, the default first.
+
+    Raises: InputError for a file that is not valid Python, a decorator whose arguments are not written out, or a name
+    that is taken.
+    """
+    found: dict[str, Method] = {}
+    for module, file in _modules():
+        text = file.read_text(encoding="utf-8")
+        if "@method(" in text:
+            for one in _declared(module, file, text):
+                if one.name in found:
+                    raise InputError(
+                        f"the method is registered in {found[one.name].module}, too", file=file, key="@method",
+                        value=one.name, remedy="give it another name",
+                    )  # fmt: skip
+                found[one.name] = one
+    return dict(sorted(found.items(), key=lambda item: (item[0] != "default", item[1].baseline, item[0])))
+
+
+def _modules() -> Iterable[tuple[str, Path]]:
+    """Names and files of the package's modules, in its rooms, too; but this one."""
+    for root in map(Path, pipeline.reconstruct.__path__):
+        for file in sorted(root.rglob("*.py")):
+            if file != Path(__file__):
+                yield ".".join(["pipeline.reconstruct", *file.relative_to(root).with_suffix("").parts]), file
+
+
+def _declared(module: str, file: Path, text: str) -> Iterable[Method]:
+    try:
+        tree = ast.parse(text)
+    except SyntaxError as error:
+        raise InputError(f"is not valid Python, line {error.lineno} ({error.msg})", file=file, remedy="correct it") from error
+    for node in tree.body:
+        for mark in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
+            if isinstance(mark, ast.Call) and isinstance(mark.func, ast.Name) and mark.func.id == "method":
+                assert isinstance(node, ast.FunctionDef)
+                try:
+                    (name,) = map(ast.literal_eval, mark.args)
+                    options = {word.arg or "**": ast.literal_eval(word.value) for word in mark.keywords}
+                    yield Method(name, module, node.name, **options)
+                except (ValueError, TypeError) as error:
+                    raise InputError(
+                        f"cannot be read, line {mark.lineno} ({error})", file=file, key="@method",
+                        remedy='write it as @method("name", about="one line", reads="footprint", baseline=False)',
+                    ) from error  # fmt: skip
+
+
+def require_method(name: str) -> str:
+    """The name of a known method. Raises: InputError with the nearest and all names."""
+    known = known_methods()
+    if name not in known:
+        near = difflib.get_close_matches(name, known, 1, cutoff=0.5)
+        raise InputError(
+            "unknown method", key="methods", value=name, allowed=", ".join(known),
+            remedy=f"did you mean {near[0]!r}?" if near else "choose from these",
+        )  # fmt: skip
+    return name

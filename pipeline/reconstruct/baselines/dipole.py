@@ -8,7 +8,8 @@ from scipy.optimize import least_squares
 
 from pipeline.geometry.fresnel import Boundary
 from pipeline.geometry.mesh import vertex_areas
-from pipeline.model.reflectance import ReflectanceModel
+from pipeline.model.reflectance import GlobalTerm
+from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.completion import measured_entries
 from pipeline.reconstruct.global_term.radial_profile import over_directions
 from pipeline.reconstruct.samples.distances import Kernel
@@ -69,13 +70,11 @@ def fit_dipole_laser(samples: Samples, laser: int) -> tuple[float, float]:
     return float(scattering), float(absorption)
 
 
-def fit_dipole(samples: Samples) -> ReflectanceModel:
+def fit_dipole(samples: Samples) -> RelightableModel:
     """The baseline: samples -> model. Its kernel depends on distance alone."""
     found = [fit_dipole_laser(samples, laser) for laser in range(len(samples.values))]
     kernels = [samples.vertex_pairs.mean(_kernel(s, a, samples.eta)) for s, a in found]
     reflectance = np.stack([0.5 * (k + k.T) for k in kernels]).astype(np.float32)
-    told = "; ".join(f"sigma_s' {s:.4g}, sigma_a {a:.4g} per mm" for s, a in found)
-    return ReflectanceModel(
-        samples.mesh, reflectance, np.zeros_like(reflectance), measured_entries(samples), Boundary(samples.eta),
-        {"method": "dipole", "fit": told},
-    )  # fmt: skip
+    medium = "; ".join(f"sigma_s' {s:.4g}, sigma_a {a:.4g} per mm" for s, a in found)
+    term = GlobalTerm(reflectance, measured_entries(samples))
+    return RelightableModel(samples.mesh, Boundary(samples.eta), (term,), {"fit": medium})

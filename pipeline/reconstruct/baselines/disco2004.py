@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from pipeline.geometry.fresnel import Boundary
-from pipeline.model.reflectance import ReflectanceModel
+from pipeline.model.reflectance import GlobalTerm
+from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.completion import measured_entries
 from pipeline.reconstruct.samples.samples import Samples
 
@@ -94,12 +95,9 @@ def fill(values: F64, known: Bool, laplacian: sparse.csr_array) -> F64:
     return np.asarray(np.where(fixed, start, np.maximum(out, 0.0)), np.float64)
 
 
-def resample_2004(samples: Samples) -> ReflectanceModel:
+def resample_2004(samples: Samples) -> RelightableModel:
     """The baseline: samples (read by bilinear look-up) -> model. R_d in mm^-2 per laser."""
     laplacian = neighbours(np.asarray(samples.mesh.vertices), np.asarray(samples.mesh.edges_unique))
     filled = [fill(*distribute(samples, laser), laplacian) for laser in range(len(samples.values))]
-    reflectance = np.stack(filled).astype(np.float32)
-    return ReflectanceModel(
-        samples.mesh, reflectance, np.zeros_like(reflectance), measured_entries(samples), Boundary(samples.eta),
-        {"method": "disco2004"},
-    )  # fmt: skip
+    term = GlobalTerm(np.stack(filled).astype(np.float32), measured_entries(samples))
+    return RelightableModel(samples.mesh, Boundary(samples.eta), (term,))

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.fresnel import Boundary
 from pipeline.geometry.mesh import interpolation, vertex_areas
-from pipeline.model.reflectance import ReflectanceModel
-from pipeline.reconstruct.global_term.completion import MOST_HARMONICS, RANGE_EDGES, measured_entries
+from pipeline.model.lambertian import LambertianTerm
+from pipeline.model.relightable import RelightableModel
+from pipeline.reconstruct.global_term.completion import MOST_HARMONICS, RANGE_EDGES
 from pipeline.reconstruct.global_term.harmonics import harmonics
 from pipeline.reconstruct.global_term.radial_profile import over_directions
 from pipeline.reconstruct.samples.samples import Samples
@@ -32,13 +33,12 @@ def spot_energies(samples: Samples, laser: int) -> F64:
     return np.where(expected > 0.3 * whole, seen * whole / np.maximum(expected, 1e-12), np.nan)
 
 
-def fit_lambertian(samples: Samples) -> ReflectanceModel:
-    """The baseline: samples -> model with R_d = albedo / area on the diagonal."""
-    area = vertex_areas(samples.mesh)
+def fit_lambertian(samples: Samples) -> RelightableModel:
+    """The baseline: samples -> model. The albedo is interpolated between the spots by kriging."""
     edge = float(samples.mesh.edges_unique_length.mean())
     covariance = harmonics(samples.mesh, MOST_HARMONICS).covariance(RANGE_EDGES * edge)
     to_spots = interpolation(samples.mesh, samples.spots.triangle, samples.spots.barycentric)
-    reflectance = np.zeros((len(samples.values), len(area), len(area)), np.float32)
+    albedos = []
     for laser in range(len(samples.values)):
         energy = spot_energies(samples, laser)
         known = np.flatnonzero(np.isfinite(energy))
@@ -46,8 +46,6 @@ def fit_lambertian(samples: Samples) -> ReflectanceModel:
         cross = to_spots[known] @ covariance
         within = cross @ to_spots[known].T + ALBEDO_NOISE * np.eye(len(known))
         albedo = mean + cross.T @ np.linalg.solve(within, energy[known] - mean)
-        np.fill_diagonal(reflectance[laser], np.maximum(albedo, 0.0) / area)
-    return ReflectanceModel(
-        samples.mesh, reflectance, np.zeros_like(reflectance), measured_entries(samples), Boundary(samples.eta),
-        {"method": "lambertian"},
-    )  # fmt: skip
+        albedos.append(np.maximum(albedo, 0.0))
+    term = LambertianTerm(np.stack(albedos).astype(np.float32))
+    return RelightableModel(samples.mesh, Boundary(samples.eta), (term,))

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from pipeline.model.reflectance import ReflectanceModel
+from pipeline.model.reflectance import GlobalTerm
+from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.boundary_fit import measure_boundary
 from pipeline.reconstruct.global_term.harmonics import Harmonics, harmonics
 from pipeline.reconstruct.global_term.radial_profile import Measured, Tilt, fit_profile
@@ -108,7 +109,7 @@ class Fit:
     """One laser's smooth model.
 
     entries: (V, V) R_d, symmetric and positive; at_spots: (S, V) the same between beams and vertices; both in mm^-2,
-    means over all directions; tilt: how single directions depart from them; field: (n, n) Y
+    means over all directions; direction_bias: how single directions depart from them; field: (n, n) Y
     """
 
     entries: F64
@@ -137,10 +138,13 @@ def fit_laser(samples: Samples, laser: int, field: SymmetricField, start: F32) -
     return Fit(entries, pairs.mean(profile) * np.exp(smooth), direction_bias, y)
 
 
-def hold_measured(samples: Samples, fits: list[Fit], lift: F64, left: F64) -> tuple[F64, F64, NDArray[np.bool_]]:
+def hold_measured(
+    samples: Samples, fits: list[Fit], lognormal_mean_factor: F64, prior_variance: F64
+) -> tuple[F64, F64, NDArray[np.bool_]]:
     """(L, V, V) R_d in mm^-2 that holds what was measured, its relative variance, and (V, V) the measured entries.
 
-    lift: (V, V) expectation over the fit; left: (V, V) relative variance of the fill, where nothing was measured.
+    lognormal_mean_factor: (V, V) expectation over the fit; prior_variance: (V, V) relative variance of the fill, where
+    nothing was measured.
 
     A sample is the mean over a beam and a hat function in one direction, an entry the mean over two hat functions and
     all directions. The fit says what lies between: sample / its expectation = entry / its expectation. Spots whose
@@ -169,9 +173,10 @@ def hold_measured(samples: Samples, fits: list[Fit], lift: F64, left: F64) -> tu
             sums += np.where(np.eye(len(sums), dtype=bool), 0.0, sums.T)  # on the diagonal both sides are one sample
         ratio = ratio / np.maximum(total, 1e-30)
         noise = np.where(measured_in_all, spread / np.maximum(total, 1e-30) ** 2, np.inf)
-        trust = left / (left + noise)  # of the sample against the fill
-        entries.append(np.maximum(fit.entries * (trust * np.where(trust > 0, ratio, 0.0) + (1 - trust) * lift), 0.0))
-        variances.append((1 - trust) * left)  # = 1 / (1 / left + 1 / noise)
+        trust = prior_variance / (prior_variance + noise)  # of the sample against the fill
+        factor = trust * np.where(trust > 0, ratio, 0.0) + (1 - trust) * lognormal_mean_factor
+        entries.append(np.maximum(fit.entries * factor, 0.0))
+        variances.append((1 - trust) * prior_variance)  # = 1 / (1 / prior_variance + 1 / noise)
     return np.stack(entries), np.stack(variances), measured_in_all
 
 
@@ -189,8 +194,8 @@ def unexplained(samples: Samples, basis: Harmonics, range_mm: float) -> F64:
     explained = (cross * gain).sum(axis=0) / np.diag(covariance)
     share = np.abs(gain) / np.maximum(np.abs(gain).sum(axis=0), 1e-12)
     seen = share.T @ np.isfinite(samples.values[:, used]).all(axis=0).astype(np.float64)
-    left = 1.0 - explained[:, None] * seen
-    return np.asarray(np.clip(np.minimum(left, left.T), 0.0, 1.0))
+    open_share = 1.0 - explained[:, None] * seen
+    return np.asarray(np.clip(np.minimum(open_share, open_share.T), 0.0, 1.0))
 
 
 def measured_entries(samples: Samples) -> NDArray[np.bool_]:
@@ -201,8 +206,8 @@ def measured_entries(samples: Samples) -> NDArray[np.bool_]:
     return out | out.T
 
 
-def complete(samples: Samples) -> ReflectanceModel:
-    """The default method: samples -> model."""
+def complete(samples: Samples) -> RelightableModel:
+    """Samples -> model of the global term alone, with the boundary that the images show."""
     edge = float(samples.mesh.edges_unique_length.mean())
     basis = harmonics(samples.mesh, MOST_HARMONICS)
     field = SymmetricField.of(basis, samples.lit, RANGE_EDGES * edge)
@@ -210,20 +215,17 @@ def complete(samples: Samples) -> ReflectanceModel:
     for laser in range(len(samples.values)):
         fits.append(fit_laser(samples, laser, field, fits[-1].field if fits else np.zeros_like(field.penalty)))
     edges = samples.vertex_pairs.distance / edge
-    left = deviation(edges) ** 2 * unexplained(samples, basis, RANGE_EDGES * edge)
+    prior_variance = deviation(edges) ** 2 * unexplained(samples, basis, RANGE_EDGES * edge)
     # What is left open about log R_d raises the expectation of R_d: the mean of a log-normal.
-    reflectance, relative, measured = hold_measured(samples, fits, np.exp(0.5 * left), left + BOTH_ENDS)
+    reflectance, relative, measured = hold_measured(samples, fits, np.exp(0.5 * prior_variance), prior_variance + BOTH_ENDS)
 
-    def expected(glow: SpotSumImage) -> F64:
-        direction_bias = sum(outward_tilt(samples.mesh, samples.spots, glow.camera.position))
+    def expected(view: SpotSumImage) -> F64:
+        direction_bias = sum(outward_tilt(samples.mesh, samples.spots, view.camera.position))
         distance = samples.spot_pairs.distance
         return np.stack([fit.at_spots * np.exp(fit.direction_bias(distance) * direction_bias) for fit in fits])
 
-    return ReflectanceModel(
-        samples.mesh,
-        reflectance.astype(np.float32),
-        (reflectance**2 * (relative + BOTH_ENDS)).astype(np.float32),
-        measured,
-        measure_boundary(samples.mesh, samples.eta, samples.glow, expected),
-        {"method": "default"},
+    variance = (reflectance**2 * (relative + BOTH_ENDS)).astype(np.float32)
+    boundary = measure_boundary(samples.mesh, samples.eta, samples.glow, expected)
+    return RelightableModel(
+        samples.mesh, boundary, (GlobalTerm(reflectance.astype(np.float32), measured, variance),)
     )

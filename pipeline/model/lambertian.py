@@ -1,0 +1,23 @@
+"""An opaque surface: light leaves where it enters. It states no R_d between different points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+from pipeline.geometry.mesh import vertex_areas
+from pipeline.model.term import F32, Axes, Term
+from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
+
+
+@dataclass(frozen=True)
+class LambertianTerm(Term):
+    """albedo: (L, V) share of the transmitted flux at a vertex that leaves there again."""
+
+    kind: ClassVar[str] = "lambertian"
+
+    albedo: Annotated[F32, Axes("laser vertex", "1")]
+
+    def image(self, light: LightOnMesh, view: ViewOfMesh) -> F32:
+        """Radiosity albedo * flux / area, linear on the faces."""
+        return view.image(light.flux * self.albedo / vertex_areas(light.mesh))

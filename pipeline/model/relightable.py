@@ -1,0 +1,129 @@
+"""The reconstructed object: a mesh, its boundary, and terms whose radiances add up; in one file without pickle."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from hw.base.errors import InputError
+from hw.base.files import load_arrays, save_arrays
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.fresnel import Boundary
+from pipeline.model.lambertian import LambertianTerm
+from pipeline.model.reflectance import GlobalTerm
+from pipeline.model.term import F32, ReflectanceColumns, Term
+from pipeline.relight.lights import Light
+from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
+
+FORMAT_VERSION = 2
+KINDS: Mapping[str, type[Term]] = {term.kind: term for term in (GlobalTerm, LambertianTerm)}
+REMEDY = "reconstruct again with this version"
+
+
+@dataclass(frozen=True)
+class RelightableModel:
+    """mesh: V vertices, mm; boundary: assumed index and, if it was measured, how its transmittance departs from the
+    smooth one; terms: what adds up, in this order; provenance: how the model came about
+
+    Raises: ValueError where the terms do not fit the mesh or each other.
+    """
+
+    mesh: trimesh.Trimesh
+    boundary: Boundary
+    terms: tuple[Term, ...]
+    provenance: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.terms:
+            raise ValueError("a model needs at least one term")
+        for term in self.terms:
+            term.check(self.lasers, len(self.mesh.vertices))
+
+    @property
+    def lasers(self) -> int:
+        """Number of wavelengths."""
+        return self.terms[0].lasers
+
+    def lit_by(self, light: Light) -> LightOnMesh:
+        """A light on this model's surface. Models with the same mesh and boundary can share it."""
+        return LightOnMesh(light, self.mesh, self.boundary, self.lasers)
+
+    def seen_by(self, camera: PinholeCamera) -> ViewOfMesh:
+        """A camera's view of this model's surface. Models with the same mesh and boundary can share it."""
+        return ViewOfMesh(camera, self.mesh, self.boundary)
+
+    def image(self, light: LightOnMesh, view: ViewOfMesh) -> F32:
+        """(L, H, W) radiance in W/(mm^2 sr), averaged over each pixel.
+
+        Raises: ValueError where light or view were prepared for another surface.
+        """
+        for prepared in (light, view):
+            if prepared.mesh is not self.mesh or prepared.boundary != self.boundary:
+                raise ValueError("prepared for another mesh or boundary: use the model's own lit_by and seen_by")
+        # Where a term for near light and the global term describe the same entries, the shares that split R_d between
+        # them (a partition of unity over distance, so that no energy counts twice) belong here, beside the sum.
+        total = self.terms[0].image(light, view)
+        for term in self.terms[1:]:
+            total = total + term.image(light, view)
+        return total
+
+    def reflectance_columns(self, vertices: Sequence[int] | NDArray[np.int64]) -> ReflectanceColumns | None:
+        """R_d from these vertices to all; None where no term states any: there is then nothing to score R_d by."""
+        parts = [part for term in self.terms if (part := term.reflectance_columns(vertices)) is not None]
+        if not parts:
+            return None
+        total = parts[0]
+        for part in parts[1:]:
+            both = None if total.variance is None or part.variance is None else total.variance + part.variance
+            total = ReflectanceColumns(total.mean + part.mean, both, total.measured | part.measured)
+        return total
+
+    def of_lasers(self, lasers: Sequence[int]) -> Self:
+        """The model with these lasers, in this order; a laser may stand in it more than once."""
+        return replace(self, terms=tuple(term.of_lasers(lasers) for term in self.terms))
+
+    def save(self, path: Path) -> None:
+        """Write an .npz, replacing any older one as a whole."""
+        arrays = {"vertices": np.asarray(self.mesh.vertices, np.float64), "faces": np.asarray(self.mesh.faces)}
+        for n, term in enumerate(self.terms):
+            arrays |= {f"term{n}.{name}": array for name, array in term.arrays().items()}
+        head = {"units": _units(self.terms), "boundary": asdict(self.boundary), "provenance": dict(self.provenance)}
+        save_arrays(path, FORMAT_VERSION, arrays, terms=[term.kind for term in self.terms], **head)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read what `save` wrote.
+
+        Raises: InputError for anything else, in one line: other versions, unknown kinds of term, arrays that do not fit.
+        """
+        head, arrays = load_arrays(path, FORMAT_VERSION, REMEDY)
+        try:
+            kinds, b = head["terms"], head["boundary"]
+            unknown = [kind for kind in kinds if kind not in KINDS]
+            if unknown:
+                raise InputError(
+                    "unknown kind of term", file=path, key="terms", value=unknown[0],
+                    allowed=", ".join(KINDS), remedy="read it with the version that wrote it, or reconstruct again",
+                )  # fmt: skip
+            parts = [{k[len(f"term{n}.") :]: a for k, a in arrays.items() if k.startswith(f"term{n}.")}
+                     for n in range(len(kinds))]  # fmt: skip
+            terms = tuple(KINDS[kind](**part) for kind, part in zip(kinds, parts, strict=True))
+            if head["units"] != _units(terms):
+                raise InputError("unknown units", file=path, key="units", value=head["units"], remedy=REMEDY)
+            mesh = trimesh.Trimesh(arrays["vertices"], arrays["faces"], process=False)
+            boundary = Boundary(float(b["eta"]), tuple(b["cosines"]), tuple(b["ratio"]))
+            return cls(mesh, boundary, terms, head["provenance"])
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise InputError(f"is damaged, or no model ({error})", file=path, remedy=REMEDY) from error
+
+
+def _units(terms: Sequence[Term]) -> dict[str, str]:
+    """Unit by name of the array in the file."""
+    named = {f"term{n}.{name}": term.axes()[name].unit for n, term in enumerate(terms) for name in term.arrays()}
+    return {"vertices": "mm"} | named
