@@ -15,7 +15,7 @@ import numpy as np
 from rich.console import Console
 
 from disco_twin.evaluate.summary import rms
-from disco_twin.run.stages import open_run, run_all
+from disco_twin.run.stages import begin_run, run_all
 
 SCENE = Path(__file__).resolve().parents[1] / "scenes" / "quick.toml"
 
@@ -23,7 +23,7 @@ SCENE = Path(__file__).resolve().parents[1] / "scenes" / "quick.toml"
 def run(quick: bool = False) -> dict[str, Any]:
     """One curve a method, a point each."""
     with tempfile.TemporaryDirectory() as folder:
-        opened = open_run(SCENE, Path(folder) / "run", "small" if quick else "full", "all", Console(stderr=True))
+        opened = begin_run(SCENE, Path(folder) / "run", "small" if quick else "full", "all", Console(stderr=True))
         summary = run_all(opened)
         took = json.loads((opened.folder.work / "pipeline.json").read_text())["methods"]
     peaks = {row["name"]: row["peak_mb"] for row in summary["stages"]}

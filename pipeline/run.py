@@ -10,7 +10,6 @@ where no renderer is installed. It writes into WORK:
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import os
 import sys
@@ -28,6 +27,7 @@ from pydantic import Field
 
 from hw.base.config import Strict, read_json
 from hw.base.errors import DiscoError, InputError, refused_by_the_disk
+from hw.base.files import write_json
 from hw.base.resources import measured
 from hw.record import Sensor
 from pipeline.calibrate.calibrate_rig import measure
@@ -37,12 +37,14 @@ from pipeline.calibrate.target_images import has_targets
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import Boundary
 from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
+from pipeline.geometry.scan import read_scan
 from pipeline.model.relightable import RelightableModel
 from pipeline.plan.targets import FOLDER
-from pipeline.reconstruct.methods import METHODS, READINGS, reconstruct
+from pipeline.reconstruct.methods import known_methods
 from pipeline.reconstruct.omissions import omissions
-from pipeline.reconstruct.samples.image_operators import ImageOperator
+from pipeline.reconstruct.samples.image_operators import IMAGE_OPERATORS
 from pipeline.reconstruct.samples.samples import Samples, SampleStatistics, take_samples
+from pipeline.reconstruct.samples.samples_file import save_samples
 from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.records import RigFile, SensorFile
 from pipeline.relight.lights import Light
@@ -85,62 +87,24 @@ class Stages:
         log.info("%s: %.1f s", name, self.rows[-1]["seconds"])
 
 
-def read_scan(path: Path) -> trimesh.Trimesh:
-    """The scanned mesh in mm, vertices as they are numbered in the file."""
-    try:
-        mesh = trimesh.load(path, process=False)
-    except Exception as error:  # the loaders raise whatever their parsing trips over
-        why = f" ({error.strerror})" if isinstance(error, OSError) and error.strerror else ""
-        raise InputError(f"not a readable mesh{why}", file=path, remedy=CAPTURE_AGAIN) from error
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise InputError("holds no triangles", file=path, remedy=CAPTURE_AGAIN)
-    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices) or not np.isfinite(mesh.vertices).all():
-        raise InputError("the scan's triangles and vertices do not fit", file=path, remedy=CAPTURE_AGAIN)
-    if not mesh.is_watertight or mesh.volume <= 0:
-        raise InputError("the scan is open or inside out", file=path, remedy="close it and orient its faces outward")
-    return mesh
-
-
-def save_samples(path: Path, samples: Samples) -> None:
-    """Arrays of the samples read by footprint: values in mm^-2, variances in mm^-4, positions in mm."""
-    np.savez(
-        path,
-        format_version=FORMAT_VERSION,
-        values=samples.values,
-        variance=samples.variance,
-        position=samples.spots.position,
-        triangle=samples.spots.triangle,
-        barycentric=samples.spots.barycentric,
-        transmitted=samples.spots.transmitted,
-        eta=samples.eta,
-    )
-
-
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Replace a file at once."""
-    partial = path.with_suffix(".part")
-    partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    os.replace(partial, path)
-
-
 def gather(
     capture: Path, calibration: Calibration, mesh: trimesh.Trimesh, settings: ReconstructConfig, stages: Stages
 ) -> tuple[dict[str, Samples], SampleStatistics]:
-    """Views, then samples, for every way of reading that the methods ask for (by footprint in any case)."""
-    ways = dict.fromkeys(["footprint", *(METHODS[m].reading for m in settings.methods)])
+    """Views, then samples, for every kind of image operator that the methods ask for (by footprint in any case)."""
+    kinds = dict.fromkeys(["footprint", *(known_methods()[name].reads for name in settings.methods)])
     with stages.stage("views"):
         cameras = [calibration.view_camera(v) for v in range(len(calibration.views))]
-        readings: dict[str, list[ImageOperator]] = {
-            way: [READINGS[way](mesh, camera, settings.eta, settings.max_view_deg) for camera in cameras]
-            for way in ways
+        operators = {
+            kind: [IMAGE_OPERATORS[kind](mesh, camera, settings.eta, settings.max_view_deg) for camera in cameras]
+            for kind in kinds
         }
     with stages.stage("samples"), StreamReader(capture) as stream:
         stream.require_complete()
-        return take_samples(stream, calibration, mesh, readings, settings)
+        return take_samples(stream, calibration, mesh, operators, settings)
 
 
 def relight(models: dict[str, RelightableModel], request: Request, work: Path, stages: Stages) -> dict[str, float]:
-    """Relit images of every method, light and view; seconds per method. Models of one mesh and boundary share the rest."""
+    """Relit images of every method, light and view; seconds per method. Models of one surface share the rest."""
     seconds, wanted = dict.fromkeys(models, 0.0), request.relight
     shared: dict[tuple[int, Boundary], tuple[dict[str, LightOnMesh], dict[str, ViewOfMesh]]] = {}
     for method, model in models.items():
@@ -181,7 +145,8 @@ def run(capture: Path, work: Path, request: Request, given: Path | None = None) 
     seconds: dict[str, float] = {}
     for name in settings.methods:
         with stages.stage(f"reconstruct {name}"):
-            models[name] = reconstruct(samples[METHODS[name].reading], METHODS[name])
+            method = known_methods()[name]
+            models[name] = method(samples[method.reads])
             models[name].save(work / f"model-{name}.npz")
         seconds[name] = stages.rows[-1]["seconds"]
     relit = relight(models, request, work, stages)

@@ -50,10 +50,10 @@ def run(
     faults: FaultsOption = None,
 ) -> None:
     """Capture, reconstruct, relight and score; writes summary.json and report.html. The same command resumes."""
-    from disco_twin.run.stages import open_run, print_scores, run_all
+    from disco_twin.run.stages import begin_run, print_scores, run_all
 
     with naming(scene):
-        opened = open_run(scene, out, profile, methods, console, faults)
+        opened = begin_run(scene, out, profile, methods, console, faults)
         console.print(f"[bold]{opened.scene.name}[/bold] into {out}", highlight=False)
         summary = run_all(opened)
     print_scores(summary, opened.methods, console)
@@ -75,13 +75,13 @@ def capture(
     """Scan and capture only: DIR/capture is what the pipeline reads."""
     from disco_twin.run.device_capture import capture_with_devices
     from disco_twin.run.progress import run_log
-    from disco_twin.run.stages import capture_stages, open_run
+    from disco_twin.run.stages import begin_run, capture_stages
 
     if rig is None and (arm or logs is not None):
         option = "--arm" if arm else "--logs"
         raise InputError("is for devices", key=option, remedy=f"name their rig file with --rig, or leave {option} out")
     with naming(scene):
-        opened = open_run(scene, out, profile, None, console, faults)
+        opened = begin_run(scene, out, profile, None, console, faults)
         with run_log(opened.folder.root / "run.log", console):
             if rig is None:
                 capture_stages(opened)

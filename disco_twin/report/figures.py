@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.reconstruct.methods import known_methods
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -17,7 +19,6 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 INK, FAINT, TRUTH = "#22272e", "#c9cdd3", "#22272e"
-COLOURS = {"default": "#1f6391", "disco2004": "#cf8a2e", "dipole": "#5f9472", "lambertian": "#8d93a0"}
 SPARE = ("#8a5a9e", "#b5534f", "#3d8f8f", "#7a6f3a")
 LASER_COLOURS = ("#c0392b", "#2e8b57", "#2f6fb5")
 DIFFERENCE_SPAN = 0.2  # the difference's colour scale runs to +- this share of the reference's 99th percentile
@@ -25,7 +26,8 @@ DIFFERENCE_SPAN = 0.2  # the difference's colour scale runs to +- this share of 
 
 def colour(method: str) -> str:
     """A method's colour is the same in every figure."""
-    return COLOURS.get(method) or SPARE[sum(map(ord, method)) % len(SPARE)]
+    known = known_methods().get(method)
+    return (known and known.colour) or SPARE[sum(map(ord, method)) % len(SPARE)]
 
 
 def new_figure(width: float, height: float, **subplots: Any) -> tuple[Figure, Any]:
@@ -282,7 +284,7 @@ def stage_figure(stages: Sequence[Mapping[str, Any]]) -> Figure:
     y = np.arange(len(names))
     for axis, key, unit in zip(axes, ("seconds", "peak_mb"), ("s", "MiB"), strict=True):
         values = [float(s[key]) for s in stages]
-        axis.barh(y, values, 0.6, color=COLOURS["default"] if key == "seconds" else COLOURS["lambertian"])
+        axis.barh(y, values, 0.6, color=colour("default" if key == "seconds" else "lambertian"))
         for at, value in zip(y, values, strict=True):
             axis.text(value, at, f" {value:.3g} {unit}" if value < 100 else f" {value:.0f} {unit}", va="center", size=8)
         axis.margins(x=0.25)

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from rich.console import Console
 
@@ -19,15 +19,13 @@ from hw.base.config import read_json
 from hw.base.errors import InputError, refused_by_the_disk
 from hw.base.files import write_atomically
 from pipeline.capture.loop import Interrupted
-from pipeline.reconstruct.settings import Method
+from pipeline.reconstruct.methods import known_methods, require_method
 from pipeline.records import StageFigures
 from pipeline.stream.files import IMAGES, JOURNAL, PLAN
 from pipeline.stream.stream import StreamReader
 
 log = logging.getLogger(__name__)
 
-METHODS: tuple[str, ...] = get_args(Method)
-BASELINES = ("dipole", "lambertian")
 OUTPUTS = {  # files that a finished stage leaves, as patterns in the run folder
     "scan": ("capture/scan.ply", "capture/rig.json", "capture/sensor.json"),
     "targets": ("capture/calibration/*/*", "capture/calibration/*/bracket/*"),
@@ -90,7 +88,7 @@ class Run:
         self.console.print(f"  {name:<12} {note}", highlight=False)
 
 
-def open_run(
+def begin_run(
     scene_file: Path, out: Path, profile: Profile, methods: str | None, console: Console, faults: bool | None = None
 ) -> Run:
     """Read the scene and claim the folder for it."""
@@ -111,20 +109,13 @@ def reopen_run(out: Path, methods: str | None, console: Console) -> Run:
 def choose_methods(text: str | None, scene: Scene) -> tuple[str, ...]:
     """`default,disco2004` or `all`, or else the scene's; the cheap baselines are always scored."""
     if text is None:
-        chosen: list[str] = list(scene.reconstruct.methods)
+        chosen = list(scene.reconstruct.methods)
     else:
-        chosen = list(METHODS) if text == "all" else [m.strip() for m in text.split(",") if m.strip()]
-    unknown = [m for m in chosen if m not in METHODS]
-    if unknown or not chosen:
-        value = unknown[0] if unknown else text
-        raise InputError(
-            "unknown method",
-            key="--methods",
-            value=value,
-            allowed=f"all, {', '.join(METHODS)}",
-            remedy="choose from these",
-        )
-    return tuple(dict.fromkeys([*chosen, *BASELINES]))
+        chosen = list(known_methods()) if text == "all" else [m.strip() for m in text.split(",") if m.strip()]
+    if not chosen:
+        raise InputError("names no method", key="--methods", value=text, remedy=f"all, or {', '.join(known_methods())}")
+    baselines = [method.name for method in known_methods().values() if method.baseline]
+    return tuple(dict.fromkeys([*(require_method(name) for name in chosen), *baselines]))
 
 
 def light_key(run: Run) -> str:

@@ -100,7 +100,7 @@ class RelightableModel:
     def load(cls, path: Path) -> Self:
         """Read what `save` wrote.
 
-        Raises: InputError for anything else, in one line: other versions, unknown kinds of term, arrays that do not fit.
+        Raises: InputError for other versions, unknown kinds of term and arrays that do not fit.
         """
         head, arrays = load_arrays(path, FORMAT_VERSION, REMEDY)
         try:
@@ -116,6 +116,8 @@ class RelightableModel:
             terms = tuple(KINDS[kind](**part) for kind, part in zip(kinds, parts, strict=True))
             if head["units"] != _units(terms):
                 raise InputError("unknown units", file=path, key="units", value=head["units"], remedy=REMEDY)
+            if not 0 <= arrays["faces"].min() <= arrays["faces"].max() < len(arrays["vertices"]):
+                raise ValueError("faces and vertices do not fit")
             mesh = trimesh.Trimesh(arrays["vertices"], arrays["faces"], process=False)
             boundary = Boundary(float(b["eta"]), tuple(b["cosines"]), tuple(b["ratio"]))
             return cls(mesh, boundary, terms, head["provenance"])

@@ -1,13 +1,13 @@
 """What a model is a sum of: a term answers for the radiance that it adds under a light in a view.
 
-A term declares its arrays, their axes and units in its annotations. The file, its checks and the choice of lasers follow
-from them, so a new kind of term is one file here and one entry in `relightable.KINDS`.
+A term declares its arrays, their axes and units in its annotations. The file, its checks and the choice of lasers
+follow from them, so a new kind of term is one file here and one entry in `relightable.KINDS`.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self, get_type_hints
 
@@ -78,7 +78,9 @@ class Term(ABC):
         known = {"laser": lasers, "vertex": vertices}
         for name, array in self.arrays().items():
             stems = [axis.split("_")[0] for axis in self.axes()[name].names]
-            if array.ndim != len(stems) or any(known.setdefault(s, n) != n for s, n in zip(stems, array.shape, strict=True)):
+            if array.ndim != len(stems) or any(
+                known.setdefault(s, n) != n for s, n in zip(stems, array.shape, strict=True)
+            ):
                 expected = ", ".join(f"{s} {known[s]}" if s in known else s for s in stems)
                 raise ValueError(f"{self.kind}.{name}: has the shape {array.shape}, not ({expected})")
             if array.dtype.kind == "f" and not np.isfinite(array).all():

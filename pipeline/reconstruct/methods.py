@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from pipeline.model.relightable import RelightableModel
     from pipeline.reconstruct.samples.samples import Samples
 
+READS = ("footprint", "bilinear")
+
 Function = TypeVar("Function", bound="Callable[[Samples], RelightableModel]")
 
 
@@ -52,7 +54,7 @@ class Method:
 
         groups = colour_groups(samples)
         kept = sorted(set(groups))
-        solve = getattr(import_module(self.module), self.function)
+        solve: Callable[[Samples], RelightableModel] = getattr(import_module(self.module), self.function)
         model = solve(select_lasers(samples, np.array(kept))).of_lasers([kept.index(group) for group in groups])
         return replace(model, provenance={"method": self.name} | dict(model.provenance))
 
@@ -97,7 +99,9 @@ def _declared(module: str, file: Path, text: str) -> Iterable[Method]:
     try:
         tree = ast.parse(text)
     except SyntaxError as error:
-        raise InputError(f"is not valid Python, line {error.lineno} ({error.msg})", file=file, remedy="correct it") from error
+        raise InputError(
+            f"is not valid Python, line {error.lineno} ({error.msg})", file=file, remedy="correct it"
+        ) from error
     for node in tree.body:
         for mark in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
             if isinstance(mark, ast.Call) and isinstance(mark.func, ast.Name) and mark.func.id == "method":
@@ -105,7 +109,10 @@ def _declared(module: str, file: Path, text: str) -> Iterable[Method]:
                 try:
                     (name,) = map(ast.literal_eval, mark.args)
                     options = {word.arg or "**": ast.literal_eval(word.value) for word in mark.keywords}
-                    yield Method(name, module, node.name, **options)
+                    declared = Method(name, module, node.name, **options)
+                    if declared.reads not in READS:
+                        raise ValueError(f"reads={declared.reads!r} is none of {', '.join(READS)}")
+                    yield declared
                 except (ValueError, TypeError) as error:
                     raise InputError(
                         f"cannot be read, line {mark.lineno} ({error})", file=file, key="@method",

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
 
 from hw.base.config import Strict
+from pipeline.reconstruct.methods import known_methods
 
-Method = Literal["default", "disco2004", "dipole", "lambertian"]
+
+def _known(name: str) -> str:
+    if name not in known_methods():
+        raise PydanticCustomError("literal_error", "no such method")
+    return name
+
+
+MethodName = Annotated[
+    str, AfterValidator(_known), Field(json_schema_extra=lambda schema: schema.update(enum=list(known_methods())))
+]
 Degrees = Annotated[float, Field(gt=0, lt=90)]
 
 
@@ -26,4 +37,4 @@ class ReconstructConfig(Strict):
     max_incidence_deg: Degrees = 65.0
     max_view_deg: Degrees = 75.0
     highlight_deg: Annotated[float, Field(ge=0, lt=90)] = 10.0
-    methods: Annotated[tuple[Method, ...], Field(min_length=1)] = ("default", "disco2004", "dipole", "lambertian")
+    methods: Annotated[tuple[MethodName, ...], Field(min_length=1)] = ("default", "disco2004", "dipole", "lambertian")

@@ -61,7 +61,7 @@ def test_a_missing_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 def test_the_folder_of_another_scene(repository: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     quick = repository / "scenes" / "quick.toml"
-    run_module.open_run(quick, tmp_path / "out", "small", None, run_module.Console(quiet=True))
+    run_module.begin_run(quick, tmp_path / "out", "small", None, run_module.Console(quiet=True))
     for arguments in (["run", str(quick)], ["capture", str(repository / "scenes" / "slab.toml")]):
         status, line = status_and_line([*arguments, "--out", str(tmp_path / "out")], capsys)
         assert status == 2

@@ -12,6 +12,7 @@ from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.completion import measured_entries
 from pipeline.reconstruct.global_term.radial_profile import over_directions
+from pipeline.reconstruct.methods import method
 from pipeline.reconstruct.samples.distances import Kernel
 from pipeline.reconstruct.samples.samples import Samples
 
@@ -70,6 +71,7 @@ def fit_dipole_laser(samples: Samples, laser: int) -> tuple[float, float]:
     return float(scattering), float(absorption)
 
 
+@method("dipole", about="a homogeneous half-space (Jensen et al. 2001)", baseline=True, colour="#5f9472")
 def fit_dipole(samples: Samples) -> RelightableModel:
     """The baseline: samples -> model. Its kernel depends on distance alone."""
     found = [fit_dipole_laser(samples, laser) for laser in range(len(samples.values))]

@@ -18,6 +18,7 @@ from pipeline.geometry.fresnel import Boundary
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.completion import measured_entries
+from pipeline.reconstruct.methods import method
 from pipeline.reconstruct.samples.samples import Samples
 
 F64 = NDArray[np.float64]
@@ -95,6 +96,7 @@ def fill(values: F64, known: Bool, laplacian: sparse.csr_array) -> F64:
     return np.asarray(np.where(fixed, start, np.maximum(out, 0.0)), np.float64)
 
 
+@method("disco2004", about="resampling and filling of the thesis (5.3)", reads="bilinear", colour="#cf8a2e")
 def resample_2004(samples: Samples) -> RelightableModel:
     """The baseline: samples (read by bilinear look-up) -> model. R_d in mm^-2 per laser."""
     laplacian = neighbours(np.asarray(samples.mesh.vertices), np.asarray(samples.mesh.edges_unique))

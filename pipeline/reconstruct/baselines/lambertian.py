@@ -12,6 +12,7 @@ from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.completion import MOST_HARMONICS, RANGE_EDGES
 from pipeline.reconstruct.global_term.harmonics import harmonics
 from pipeline.reconstruct.global_term.radial_profile import over_directions
+from pipeline.reconstruct.methods import method
 from pipeline.reconstruct.samples.samples import Samples
 
 F64 = NDArray[np.float64]
@@ -33,6 +34,7 @@ def spot_energies(samples: Samples, laser: int) -> F64:
     return np.where(expected > 0.3 * whole, seen * whole / np.maximum(expected, 1e-12), np.nan)
 
 
+@method("lambertian", about="an opaque surface of one albedo a vertex", baseline=True, colour="#8d93a0")
 def fit_lambertian(samples: Samples) -> RelightableModel:
     """The baseline: samples -> model. The albedo is interpolated between the spots by kriging."""
     edge = float(samples.mesh.edges_unique_length.mean())

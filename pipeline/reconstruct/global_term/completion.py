@@ -217,7 +217,9 @@ def complete(samples: Samples) -> RelightableModel:
     edges = samples.vertex_pairs.distance / edge
     prior_variance = deviation(edges) ** 2 * unexplained(samples, basis, RANGE_EDGES * edge)
     # What is left open about log R_d raises the expectation of R_d: the mean of a log-normal.
-    reflectance, relative, measured = hold_measured(samples, fits, np.exp(0.5 * prior_variance), prior_variance + BOTH_ENDS)
+    reflectance, relative, measured = hold_measured(
+        samples, fits, np.exp(0.5 * prior_variance), prior_variance + BOTH_ENDS
+    )
 
     def expected(view: SpotSumImage) -> F64:
         direction_bias = sum(outward_tilt(samples.mesh, samples.spots, view.camera.position))
@@ -226,6 +228,4 @@ def complete(samples: Samples) -> RelightableModel:
 
     variance = (reflectance**2 * (relative + BOTH_ENDS)).astype(np.float32)
     boundary = measure_boundary(samples.mesh, samples.eta, samples.glow, expected)
-    return RelightableModel(
-        samples.mesh, boundary, (GlobalTerm(reflectance.astype(np.float32), measured, variance),)
-    )
+    return RelightableModel(samples.mesh, boundary, (GlobalTerm(reflectance.astype(np.float32), measured, variance),))

@@ -147,3 +147,6 @@ def bilinear_reading(mesh: trimesh.Trimesh, camera: PinholeCamera, eta: float, m
     share = np.zeros(len(vertices))
     share[seen] = 1.0
     return ImageOperator(operator, share, np.where(share > 0, cosine, 0.0))
+
+
+IMAGE_OPERATORS = {"footprint": footprint_reading, "bilinear": bilinear_reading}  # as methods ask for them

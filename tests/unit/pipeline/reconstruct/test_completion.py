@@ -21,7 +21,7 @@ from pipeline.reconstruct.global_term.completion import (
     measured_entries,
 )
 from pipeline.reconstruct.global_term.harmonics import harmonics
-from pipeline.reconstruct.methods import METHODS, reconstruct
+from pipeline.reconstruct.methods import known_methods
 from pipeline.reconstruct.omissions import colour_groups, is_opaque
 from pipeline.reconstruct.samples.samples import Samples
 from pipeline.reconstruct.samples.spots import outward_tilt
@@ -58,7 +58,7 @@ def test_solve_agrees_with_the_dense_normal_equations(small: Synthetic, field: S
 
 def test_completes_what_was_not_measured(small: Synthetic) -> None:
     """Expected behaviour: entries without any sample near them come out nearly as well as measured ones."""
-    model = complete(small.samples)
+    model = complete(small.samples).terms[0]
     r = model.reflectance[0]
     np.testing.assert_array_equal(r, r.T)
     assert (r > 0).all()
@@ -73,7 +73,7 @@ def test_completes_what_was_not_measured(small: Synthetic) -> None:
 
 def test_variance_covers_the_error(small: Synthetic) -> None:
     """Expected behaviour: errors are within a few of the stated deviations, and rarely beyond."""
-    model = complete(small.samples)
+    model = complete(small.samples).terms[0]
     z = (model.reflectance[0] - small.truth[0]) / np.sqrt(model.variance[0])
     assert np.sqrt((z**2).mean()) < 1.5
     assert (np.abs(z) > 4).mean() < 0.01
@@ -108,7 +108,7 @@ def test_measured_entries_hold_the_samples() -> None:
     to entry, which no smooth fill would follow; every entry that one spot observed, and no other, is called measured.
     """
     s, spots, vertices = spots_on_vertices(make(spots=80, noise=0.0, contrast=0.0), np.random.default_rng(7))
-    model = complete(s)
+    model = complete(s).terms[0]
     smooth = SymmetricField.of(harmonics(s.mesh, 500), s.lit, RANGE_EDGES * float(s.mesh.edges_unique_length.mean()))
     fit = fit_laser(s, 0, smooth, np.zeros_like(smooth.penalty))
     expected = fit.at_spots * np.exp(fit.direction_bias(s.spot_pairs.distance) * s.direction_bias)
@@ -192,7 +192,7 @@ def test_size_does_not_matter(small: Synthetic) -> None:
         s, mesh=mesh, spots=spots, values=s.values / 100, dark_variance=s.dark_variance / 1e4,
         noise_per_signal=s.noise_per_signal / 100,
     )  # fmt: skip
-    np.testing.assert_allclose(100 * complete(grown).reflectance, complete(s).reflectance, rtol=0.02)
+    np.testing.assert_allclose(100 * complete(grown).terms[0].reflectance, complete(s).terms[0].reflectance, rtol=0.02)
 
 
 def test_a_spot_pulls_the_model_as_far_as_its_precision_says(small: Synthetic, field: SymmetricField) -> None:
@@ -219,8 +219,8 @@ def test_noisy_tails_do_not_bias() -> None:
     level = 3e-4  # of the order of the values at half a turn
     values = made.samples.values + level * rng.standard_normal(made.samples.values.shape).astype(np.float32)
     dark = np.full_like(values, level**2)
-    model = complete(replace(made.samples, values=values, dark_variance=dark))
-    clean = complete(made.samples)
+    model = complete(replace(made.samples, values=values, dark_variance=dark)).terms[0]
+    clean = complete(made.samples).terms[0]
     tail = made.samples.vertex_pairs.distance > 10
     assert (values[0][made.samples.spot_pairs.distance > 14] < 0).mean() > 0.2
     noise, fit = (np.log(model.reflectance[0][tail].sum() / m[0][tail].sum()) for m in (clean.reflectance, made.truth))
@@ -243,9 +243,9 @@ def test_equal_wavelengths_are_solved_once_and_nothing_changes() -> None:
     )
     assert colour_groups(double) == [0, 0]
     assert colour_groups(make(spots=40, lasers=2).samples) == [0, 1]
-    model = reconstruct(double, METHODS["default"])
+    model = known_methods()["default"](double).terms[0]
     np.testing.assert_array_equal(model.reflectance[0], model.reflectance[1])
-    forced = complete(double)  # both solved; the second starts from the first and stops a little further on
+    forced = complete(double).terms[0]  # both solved; the second starts from the first and stops a little further on
     np.testing.assert_allclose(model.reflectance[1], forced.reflectance[1], rtol=0.05)
 
 
@@ -256,8 +256,10 @@ def test_opaque_objects_have_no_global_term() -> None:
     opaque = replace(made.samples, values=values)
     assert is_opaque(opaque)
     assert not is_opaque(made.samples)
-    model = reconstruct(opaque, METHODS["default"])
-    assert np.count_nonzero(model.reflectance[0]) == len(model.mesh.vertices)
+    model = known_methods()["default"](opaque)
+    assert [term.kind for term in model.terms] == ["lambertian"]
+    assert model.provenance == {"method": "default"}
+    assert model.reflectance_columns([0]) is None
 
 
 def test_measured_entries_come_in_pairs(small: Synthetic) -> None:

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from pipeline.geometry.camera import PinholeCamera, look_at
-from pipeline.geometry.fresnel import transmittance
-from pipeline.relight.view_matrix import relit_image, view_matrix
+from pipeline.geometry.fresnel import Boundary, transmittance
+from pipeline.relight.on_mesh import ViewOfMesh
 
 
 def camera(position: tuple[float, float, float] = (450.0, 0.0, 80.0), focal: float = 1300.0) -> PinholeCamera:
@@ -18,11 +18,15 @@ def camera(position: tuple[float, float, float] = (450.0, 0.0, 80.0), focal: flo
     return PinholeCamera(96, 62, np.array([focal, focal]) / 2, np.array([48.0, 31.0]), np.zeros(5), pose)
 
 
+def relit_image(radiosity: np.ndarray, mesh: trimesh.Trimesh, seen_by: PinholeCamera, **options: int) -> np.ndarray:
+    return ViewOfMesh(seen_by, mesh, Boundary(1.3), **options).image(radiosity)
+
+
 def test_a_sphere_of_constant_radiosity_shows_f_t() -> None:
     """Expected: L = F_t(w_o) / pi * B with the sphere's exact normals, falling to zero at the rim."""
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=20)
     mesh.vertices *= np.sqrt(4 * np.pi * 400 / mesh.area)  # the inscribed mesh is 0.1 % too small
-    view = view_matrix(mesh, camera(), 1.3, supersample=4)
+    view = ViewOfMesh(camera(), mesh, Boundary(1.3))
     image = view.image(np.full((2, len(mesh.vertices)), 5.0))
     assert image.shape == (2, 62, 96)
     assert image.dtype == np.float32
@@ -41,7 +45,7 @@ def test_radiosity_is_linear_on_faces_and_seen_where_the_camera_projects_it() ->
     corners = np.array([[0, -30.0, -20], [0, 30, -20], [0, 30, 20], [0, -30, 20]])
     mesh = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
     distorted = replace(camera((450.0, 30.0, 80.0)), distortion=np.array([-0.9, 0.3, 0.01, -0.02, 0.0]))
-    view = view_matrix(mesh, distorted, 1.0, supersample=1)
+    view = ViewOfMesh(distorted, mesh, Boundary(1.0), supersample=1)
     image = view.image((100 + corners @ [0, 2.0, -1.0])[None])[0]
     inside = np.argwhere(view.coverage == 1)
     origins, directions = distorted.rays(inside[:, ::-1] + 0.5)
@@ -55,7 +59,7 @@ def test_radiosity_is_linear_on_faces_and_seen_where_the_camera_projects_it() ->
 
 def test_flat_faces_with_creases_keep_their_own_normals() -> None:
     box = trimesh.creation.box(extents=(20, 30, 24))
-    image = relit_image(np.ones((1, 8)), box, camera((450.0, 0.0, 0.0), focal=2000.0), 1.3)[0]
+    image = relit_image(np.ones((1, 8)), box, camera((450.0, 0.0, 0.0), focal=2000.0))[0]
     assert image[31, 48] == pytest.approx(float(transmittance(1.0, 1.3)) / np.pi, rel=1e-4)
     assert image[31, 35:60].min() > 0.999 * image[31, 48]
 
@@ -65,15 +69,15 @@ def test_what_stands_in_front_hides_and_the_inside_is_black() -> None:
     far = trimesh.creation.box(extents=(2, 20, 20), transform=trimesh.transformations.translation_matrix([-20, 0, 0]))
     both = trimesh.util.concatenate([near, far])
     radiosity = np.concatenate([np.zeros(8), np.ones(8)])[None]
-    image = relit_image(radiosity, both, camera((450.0, 0.0, 0.0)), 1.3)
+    image = relit_image(radiosity, both, camera((450.0, 0.0, 0.0)))
     assert image.max() == 0
     inverted = trimesh.Trimesh(near.vertices, near.faces[:, ::-1], process=False)
-    assert relit_image(np.ones((1, 8)), inverted, camera(), 1.3).max() == 0
+    assert relit_image(np.ones((1, 8)), inverted, camera()).max() == 0
 
 
 def test_supersampling_converges_at_the_rim() -> None:
     mesh = trimesh.creation.icosphere(subdivisions=2, radius=20)
     radiosity = np.random.default_rng(0).random((1, len(mesh.vertices)))
-    fine = relit_image(radiosity, mesh, camera(), 1.3, supersample=16)
-    errors = [np.abs(relit_image(radiosity, mesh, camera(), 1.3, supersample=s) - fine).mean() for s in (1, 4)]
+    fine = relit_image(radiosity, mesh, camera(), supersample=16)
+    errors = [np.abs(relit_image(radiosity, mesh, camera(), supersample=s) - fine).mean() for s in (1, 4)]
     assert errors[1] < errors[0] / 4
