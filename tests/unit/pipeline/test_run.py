@@ -12,13 +12,17 @@ import numpy as np
 import pytest
 from reconstruct_capture import ETA, RADIUS, SENSOR, reflectance, rig, write_capture
 
+from hw.base.errors import InputError
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
 from pipeline.geometry.fresnel import transmittance
 from pipeline.geometry.mesh import vertex_areas
+from pipeline.geometry.scan import read_scan
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.boundary_fit import measure_boundary
+from pipeline.reconstruct.methods import known_methods
 from pipeline.reconstruct.samples.image_operators import bilinear_reading, footprint_reading
 from pipeline.reconstruct.samples.samples import take_samples
+from pipeline.reconstruct.samples.samples_file import load_samples
 from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.run import Request, main, run
 from pipeline.stream.stream import StreamReader
@@ -154,6 +158,29 @@ def test_the_model_relights_the_sphere(result) -> None:  # type: ignore[no-untyp
         total = model.terms[0].reflectance[laser] @ area
         assert total.mean() == pytest.approx(exact, rel=0.03)
         assert total.std() < 0.03 * exact
+
+
+def test_samples_are_read_back(captured, result, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    """Expected behaviour: a method that is given the samples' file makes the same model, bit for bit."""
+    folder, _ = captured
+    work, _ = result
+    samples, _ = samples_of(folder, read_scan(folder / "scan.ply"), footprint_reading)
+    again = load_samples(work / "samples.npz")
+    for name in ("values", "dark_variance", "noise_per_signal", "oblique", "direction_bias"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(samples, name))
+    model = known_methods()["default"](again)
+    model.save(tmp_path / "again.npz")
+    with np.load(work / "model-default.npz") as kept, np.load(tmp_path / "again.npz") as made:
+        assert kept.files == made.files
+        for name in kept.files:
+            np.testing.assert_array_equal(kept[name], made[name])
+    with np.load(work / "samples.npz") as data:
+        np.savez(tmp_path / "cut.npz", **{n: a for n, a in data.items() if n != "view0.image"})
+    np.savez(tmp_path / "old.npz", format_version=1, values=samples.values)
+    for name in ("cut.npz", "old.npz", "none.npz"):
+        with pytest.raises(InputError, match=name) as caught:
+            load_samples(tmp_path / name)
+        assert "\n" not in str(caught.value)
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
