@@ -40,8 +40,9 @@ from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
 from pipeline.geometry.scan import read_scan
 from pipeline.model.relightable import RelightableModel
 from pipeline.plan.targets import FOLDER
-from pipeline.reconstruct.methods import known_methods
+from pipeline.reconstruct.methods import reconstruct
 from pipeline.reconstruct.omissions import omissions
+from pipeline.reconstruct.registry import known_methods
 from pipeline.reconstruct.samples.image_operators import IMAGE_OPERATORS
 from pipeline.reconstruct.samples.samples import Samples, SampleStatistics, take_samples
 from pipeline.reconstruct.samples.samples_file import save_samples
@@ -145,8 +146,7 @@ def run(capture: Path, work: Path, request: Request, given: Path | None = None) 
     seconds: dict[str, float] = {}
     for name in settings.methods:
         with stages.stage(f"reconstruct {name}"):
-            method = known_methods()[name]
-            models[name] = method(samples[method.reads])
+            models[name] = reconstruct(samples[known_methods()[name].reads], name)
             models[name].save(work / f"model-{name}.npz")
         seconds[name] = stages.rows[-1]["seconds"]
     relit = relight(models, request, work, stages)

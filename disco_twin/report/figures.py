@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.reconstruct.methods import known_methods
+from pipeline.reconstruct.registry import known_methods
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -19,7 +19,7 @@ from hw.base.config import read_json
 from hw.base.errors import InputError, refused_by_the_disk
 from hw.base.files import write_atomically
 from pipeline.capture.loop import Interrupted
-from pipeline.reconstruct.methods import known_methods, require_method
+from pipeline.reconstruct.registry import known_methods, require_method
 from pipeline.records import StageFigures
 from pipeline.stream.files import IMAGES, JOURNAL, PLAN
 from pipeline.stream.stream import StreamReader

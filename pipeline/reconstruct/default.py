@@ -5,8 +5,8 @@ from __future__ import annotations
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.baselines.lambertian import fit_lambertian
 from pipeline.reconstruct.global_term.completion import complete
-from pipeline.reconstruct.methods import method
 from pipeline.reconstruct.omissions import is_opaque
+from pipeline.reconstruct.registry import method
 from pipeline.reconstruct.samples.samples import Samples
 
 

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
 from hw.base.config import Strict
-from pipeline.reconstruct.methods import known_methods
+from pipeline.reconstruct.registry import known_methods
 
 
 def _known(name: str) -> str:

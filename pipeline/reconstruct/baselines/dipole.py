@@ -12,7 +12,7 @@ from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.completion import measured_entries
 from pipeline.reconstruct.global_term.radial_profile import over_directions
-from pipeline.reconstruct.methods import method
+from pipeline.reconstruct.registry import method
 from pipeline.reconstruct.samples.distances import Kernel
 from pipeline.reconstruct.samples.samples import Samples
 

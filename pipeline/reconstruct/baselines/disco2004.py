@@ -18,7 +18,7 @@ from pipeline.geometry.fresnel import Boundary
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.completion import measured_entries
-from pipeline.reconstruct.methods import method
+from pipeline.reconstruct.registry import method
 from pipeline.reconstruct.samples.samples import Samples
 
 F64 = NDArray[np.float64]

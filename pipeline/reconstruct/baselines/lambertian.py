@@ -12,7 +12,7 @@ from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.completion import MOST_HARMONICS, RANGE_EDGES
 from pipeline.reconstruct.global_term.harmonics import harmonics
 from pipeline.reconstruct.global_term.radial_profile import over_directions
-from pipeline.reconstruct.methods import method
+from pipeline.reconstruct.registry import method
 from pipeline.reconstruct.samples.samples import Samples
 
 F64 = NDArray[np.float64]

@@ -19,7 +19,7 @@ from pipeline.geometry.mesh import vertex_areas
 from pipeline.geometry.scan import read_scan
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.boundary_fit import measure_boundary
-from pipeline.reconstruct.methods import known_methods
+from pipeline.reconstruct.methods import reconstruct
 from pipeline.reconstruct.samples.image_operators import bilinear_reading, footprint_reading
 from pipeline.reconstruct.samples.samples import take_samples
 from pipeline.reconstruct.samples.samples_file import load_samples
@@ -168,7 +168,7 @@ def test_samples_are_read_back(captured, result, tmp_path: Path) -> None:  # typ
     again = load_samples(work / "samples.npz")
     for name in ("values", "dark_variance", "noise_per_signal", "oblique", "direction_bias"):
         np.testing.assert_array_equal(getattr(again, name), getattr(samples, name))
-    model = known_methods()["default"](again)
+    model = reconstruct(again, "default")
     model.save(tmp_path / "again.npz")
     with np.load(work / "model-default.npz") as kept, np.load(tmp_path / "again.npz") as made:
         assert kept.files == made.files

@@ -21,7 +21,7 @@ from pipeline.reconstruct.global_term.completion import (
     measured_entries,
 )
 from pipeline.reconstruct.global_term.harmonics import harmonics
-from pipeline.reconstruct.methods import known_methods
+from pipeline.reconstruct.methods import reconstruct
 from pipeline.reconstruct.omissions import colour_groups, is_opaque
 from pipeline.reconstruct.samples.samples import Samples
 from pipeline.reconstruct.samples.spots import outward_tilt
@@ -243,7 +243,7 @@ def test_equal_wavelengths_are_solved_once_and_nothing_changes() -> None:
     )
     assert colour_groups(double) == [0, 0]
     assert colour_groups(make(spots=40, lasers=2).samples) == [0, 1]
-    model = known_methods()["default"](double).terms[0]
+    model = reconstruct(double, "default").terms[0]
     np.testing.assert_array_equal(model.reflectance[0], model.reflectance[1])
     forced = complete(double).terms[0]  # both solved; the second starts from the first and stops a little further on
     np.testing.assert_allclose(model.reflectance[1], forced.reflectance[1], rtol=0.05)
@@ -256,7 +256,7 @@ def test_opaque_objects_have_no_global_term() -> None:
     opaque = replace(made.samples, values=values)
     assert is_opaque(opaque)
     assert not is_opaque(made.samples)
-    model = known_methods()["default"](opaque)
+    model = reconstruct(opaque, "default")
     assert [term.kind for term in model.terms] == ["lambertian"]
     assert model.provenance == {"method": "default"}
     assert model.reflectance_columns([0]) is None

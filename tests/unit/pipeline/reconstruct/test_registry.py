@@ -13,12 +13,13 @@ from reconstruct_synthetic import make
 import pipeline.reconstruct
 from hw.base.config import check
 from hw.base.errors import InputError
-from pipeline.reconstruct.methods import known_methods, require_method
+from pipeline.reconstruct.methods import reconstruct
+from pipeline.reconstruct.registry import known_methods, require_method
 from pipeline.reconstruct.settings import ReconstructConfig
 
 MINE = """
 from pipeline.reconstruct.baselines.lambertian import fit_lambertian
-from pipeline.reconstruct.methods import method
+from pipeline.reconstruct.registry import method
 
 @method("grey", about="the mean albedo", colour="#123456")
 def grey(samples):
@@ -46,7 +47,7 @@ def test_a_new_file_is_a_new_method(room: Path) -> None:
     (room / "grey.py").write_text(MINE)
     assert known_methods()["grey"].colour == "#123456"
     assert ReconstructConfig.model_validate({"methods": ["grey"]}).methods == ("grey",)
-    model = known_methods()["grey"](make(spots=40).samples)
+    model = reconstruct(make(spots=40).samples, "grey")
     assert model.provenance == {"method": "grey"}
     assert [term.kind for term in model.terms] == ["lambertian"]
 
