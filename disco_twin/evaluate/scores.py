@@ -1,4 +1,4 @@
-"""Relit images against references, R_d against the truth: design.md's scores for every method of a run."""
+"""Relit images against references, R_d against the truth, for every method of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ground-truth R_d from photons of its own (design: "What R_d is, exactly"); the pipeline never sees it.
+"""Ground-truth R_d from photons of its own (docs/conventions.md, "R_d"); the pipeline never sees it.
 
 Photons are launched cosine-weighted over the hat function of vertex u, their escaped power is weighted by the hat
 function of vertex v: cosine in, cosine out, which is what is reciprocal.
