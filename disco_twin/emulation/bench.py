@@ -156,7 +156,7 @@ class Bench:
             raise DiscoError(f"the twin has no light for a turntable at {self.spindle.position(now):.2f} deg")
         u, v = (int(galvo.position(now)) for galvo in self.board.galvos)
         flood = bool(self.board.lines >> FLOOD_LINE & 1)
-        self.twin.alter(steps=(u, v), gate=light[0] if light else -1, flood=flood)
+        self.twin.alter(u=u, v=v, gate=light[0] if light else -1, flood=flood)
 
 
 @dataclass

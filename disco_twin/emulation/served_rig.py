@@ -6,20 +6,19 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_twin.emulation.emulated_rig import Emulation
 from disco_twin.emulation.rig_file_of import rig_file_of
+from disco_twin.emulation.serve import Server
+from disco_twin.emulation.twin_rig import TwinRig, watts_per_count
 from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.clock import WallClock
 from hw.base.errors import DiscoError, InputError
 from hw.base.files import require_folder, take_lock, write_atomically
 from hw.interface import Aim
-
-if TYPE_CHECKING:
-    from disco_twin.emulation.emulated_rig import Emulation
 
 F32 = NDArray[np.float32]
 
@@ -41,9 +40,6 @@ class Darkness:
 
 def emulated_devices(scene: TwinRigConfig, seed: int) -> Emulation:
     """The devices of a scene in real time, for cameras elsewhere: the photodiode reads what falls on it now."""
-    from disco_twin.emulation.emulated_rig import Emulation
-    from disco_twin.emulation.twin_rig import TwinRig, watts_per_count
-
     emulation = Emulation(TwinRig(scene, Darkness(), seed), WallClock())
     bench = emulation.bench
 
@@ -60,8 +56,6 @@ def emulated_devices(scene: TwinRigConfig, seed: int) -> Emulation:
 @contextmanager
 def served(scene: TwinRigConfig, seed: int, folder: Path) -> Iterator[Path]:
     """Emulated devices on pseudo-terminals in a folder, and the rig file that reaches them."""
-    from disco_twin.emulation.serve import Server
-
     require_folder(folder, "--ports")
     lines, path = emulated_devices(scene, seed).lines, folder / "rig.toml"
     remedy = "choose another --ports, or take it away"

@@ -146,22 +146,9 @@ class TwinRig:
         self._exposed[camera] = (self.scene, count)
         return count
 
-    def alter(
-        self,
-        *,
-        angle: int | None = None,
-        steps: tuple[int, int] | None = None,
-        gate: int | None = None,
-        flood: bool | None = None,
-    ) -> None:
-        """Change the state of the rig; what is not named stays."""
-        s = self.scene
-        self.scene = _Scene(
-            s.angle if angle is None else angle,
-            *((s.u, s.v) if steps is None else steps),
-            s.gate if gate is None else gate,
-            s.flood if flood is None else flood,
-        )
+    def alter(self, **changes: int | bool) -> None:
+        """Change the state of the rig (`_Scene`); what is not named stays."""
+        self.scene = replace(self.scene, **changes)  # type: ignore[arg-type]
 
 
 @dataclass
@@ -206,7 +193,7 @@ class TwinProjector:
         for name, value in (("u", u), ("v", v)):
             if not 0 <= value < steps:
                 raise InputError("no such mirror step", key=name, value=value, allowed=f"0 to {steps - 1}")
-        self.rig.alter(steps=(int(u), int(v)))
+        self.rig.alter(u=int(u), v=int(v))
 
 
 @dataclass

@@ -9,7 +9,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from disco_twin.emulation.emulated_rig import open_scene_rig
+from disco_twin.emulation.served_rig import Darkness
+from disco_twin.emulation.twin_rig import TwinRig
 from disco_twin.experiment.run_folder import content_key
+from disco_twin.run import simulate
 from hw.base.errors import InputError, naming
 from hw.base.files import require_folder, write_atomically
 from hw.rig.rig_file import EMULATED, RigFile
@@ -20,7 +24,6 @@ from pipeline.stream.files import IMAGES
 from pipeline.stream.stream import StreamReader
 
 if TYPE_CHECKING:
-    from disco_twin.emulation.twin_rig import TwinRig
     from disco_twin.run.progress import Report
     from disco_twin.run.stages import Run
 
@@ -52,7 +55,7 @@ def _begun_with(record: Path) -> RigFile:
     except InputError as error:
         problem = f"the capture's own copy of its rig file cannot be used ({error.problem})"
         remedy = "put the rig file there that the capture was begun with, or choose another --out"
-        raise error.amended(problem, file=record, remedy=remedy) from error
+        raise error.amended(problem=problem, file=record, remedy=remedy) from error
 
 
 def _has_images(folder: Path) -> bool:
@@ -65,9 +68,6 @@ def _has_images(folder: Path) -> bool:
 
 def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool) -> None:
     """Scan and capture; continues where it was interrupted, if the rig is the same and has not moved since."""
-    from disco_twin.emulation.emulated_rig import open_scene_rig
-    from disco_twin.run import simulate
-
     file, experiment, folder = open_rig_file(run, path, armed), run.experiment, run.folder
     if logs is not None:
         require_folder(logs, "--logs")
@@ -88,13 +88,8 @@ def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool
 
 def _twin(run: Run, file: RigFile) -> TwinRig | None:
     """What simulated cameras look at; emulated devices without one need no light."""
-    from disco_twin.emulation.served_rig import Darkness
-    from disco_twin.emulation.twin_rig import TwinRig
-
     if file.simulated_cameras:
-        from disco_twin.run.simulate import twin_rig
-
-        return twin_rig(run.experiment, run.folder)
+        return simulate.twin_rig(run.experiment, run.folder)
     if EMULATED in file.ports().values():
         return TwinRig(run.scene.rig, Darkness(), run.scene.seed)
     return None

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import date, time
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 MOST_SHOWN = 160  # characters of a value
 
@@ -36,19 +36,10 @@ class InputError(DiscoError):
         tail = ("" if allowed is None else f" (allowed: {allowed})") + ("" if remedy is None else f". Remedy: {remedy}")
         super().__init__(f"{where}{what}{problem}{tail}")
 
-    def amended(
-        self, problem: str | None = None, *, file: str | Path | None = None, key: str | None = None,
-        remedy: str | None = None,
-    ) -> InputError:  # fmt: skip
-        """The same error, with what is given in the place of what it named."""
-        return InputError(
-            problem or self.problem,
-            file=self.file if file is None else file,
-            key=key or self.key,
-            value=self.value,
-            allowed=self.allowed,
-            remedy=remedy or self.remedy,
-        )
+    def amended(self, **changes: Any) -> InputError:
+        """The same error, with another problem, file, key, value, allowed range or remedy."""
+        same = {name: getattr(self, name) for name in ("problem", "file", "key", "value", "allowed", "remedy")}
+        return InputError(**(same | changes))
 
     def within(self, file: str | Path) -> InputError:
         """The same error, known to come from `file`, unless it names a file already."""
@@ -81,15 +72,9 @@ class DeviceError(DiscoError):
         self.without_remedy = f"{where}: {device} {problem}"
         super().__init__(f"{self.without_remedy}. Remedy: {remedy}")
 
-    def set_by(self, key: str, port: str) -> Self:
-        """The same error; `key` of the rig file says which port the device hangs on."""
-        return type(self)(port, self.device, self.problem, self.remedy, key=key, file=self.file)
-
-    def within(self, file: str | Path) -> Self:
-        """The same error, its key being one of `file`, unless it names a file already or no key."""
-        if self.file is not None or self.key is None:
-            return self
-        return type(self)(self.port, self.device, self.problem, self.remedy, key=self.key, file=file)
+    def set_by(self, key: str, port: str, file: str | Path | None) -> Self:
+        """The same error, of a device whose port is set by `key` of a rig file."""
+        return type(self)(port, self.device, self.problem, self.remedy, key=key, file=file)
 
 
 class NoAnswer(DeviceError):
@@ -127,7 +112,7 @@ def naming(file: str | Path) -> Iterator[None]:
     """Errors about a key that leave this block name the file that the key stands in."""
     try:
         yield
-    except (InputError, DeviceError) as error:
+    except InputError as error:
         raise error.within(file) from error.__cause__
 
 

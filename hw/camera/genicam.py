@@ -36,7 +36,7 @@ class FrameLost(Exception):
 
 
 @dataclass(frozen=True)
-class Frame:
+class CameraFrame:
     """One frame as the camera sent it, complete.
 
     pixels: (height, width) uint16 digital numbers, padding and packing removed; timestamp_s: the camera's own clock;
@@ -57,7 +57,7 @@ class Grabber(Protocol):
     def set_exposure(self, seconds: float) -> float:
         """Ask for an exposure; the seconds that the camera reads back."""
 
-    def grab(self, timeout_s: float) -> Frame:
+    def grab(self, timeout_s: float) -> CameraFrame:
         """Trigger one exposure and return its frame. Raises `FrameLost` where a new attempt may help."""
 
     def restart(self) -> None:
@@ -132,7 +132,7 @@ class GenicamCamera:
             "card (jumbo frames, receive buffers), then repeat the command"
         )
 
-    def _checked(self, frame: Frame, wanted_s: float) -> U16:
+    def _checked(self, frame: CameraFrame, wanted_s: float) -> U16:
         if frame.exposure_s is not None and not abs(frame.exposure_s - wanted_s) <= TOLERANCE * wanted_s:
             raise FrameLost(f"it was exposed for {frame.exposure_s * 1e6:.1f} us, not {wanted_s * 1e6:.1f} us")
         if frame.timestamp_s <= self._last_s:

@@ -9,17 +9,20 @@ from __future__ import annotations
 import importlib
 import logging
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from hw.base.errors import InputError
-from hw.camera.genicam import CameraError, Frame, FrameLost
+from hw.camera.genicam import CameraError, CameraFrame, FrameLost
 
 log = logging.getLogger(__name__)
 
 HEARTBEAT_S = 10.0  # cameras wait 3 s by default for a sign of life
 SLICE_MS = 20  # a wait is cut into these, so that Ctrl-C is obeyed
+CABLE = ". Remedy: check its cable and power"
 OFF = ("ExposureAuto", "GainAuto", "BlackLevelAuto", "BalanceWhiteAuto")  # what would make the sensor non-linear
 
 
@@ -55,30 +58,33 @@ class VivaGrabber:
         self._vg = _client()
         self._address = address
         self._stream: Any = None
-        self._camera = self._connect(address)
+        with self._errors():
+            self._camera = self._connect(address)
+            try:
+                self._refuse_other(serial)
+                self._configure(pixel_format, size)
+                self._open_stream()
+            except BaseException:
+                self.close()
+                raise
+
+    @contextmanager
+    def _errors(self, remedy: str = "") -> Iterator[None]:
+        """Errors of the client as ours."""
         try:
-            self._refuse_other(serial)
-            self._configure(pixel_format, size)
-            self._open_stream()
+            yield
         except self._vg.GenicamError as error:
-            self.close()
-            raise CameraError(f"camera {address}: {error}") from error
-        except BaseException:
-            self.close()
-            raise
+            raise CameraError(f"camera {self._address}: {error}{remedy}") from error
 
     def _connect(self, address: str) -> Any:
         vg = self._vg
-        try:
-            for _ in range(3):  # discovery is a broadcast, which nobody repeats when it is lost
-                found = [d for d in vg.discover(1000, all=True) if d.ip == address]
-                if found:
-                    return self._claim(found[0])
-            found = [d for d in _on_usb(vg) if d.serial == address]
+        for _ in range(3):  # discovery is a broadcast, which nobody repeats when it is lost
+            found = [d for d in vg.discover(1000, all=True) if d.ip == address]
             if found:
-                return vg.connect_u3v(found[0])
-        except vg.GenicamError as error:
-            raise CameraError(f"camera {address}: {error}") from error
+                return self._claim(found[0])
+        found = [d for d in _on_usb(vg) if d.serial == address]
+        if found:
+            return vg.connect_u3v(found[0])
         raise CameraError(
             f"camera {address} does not answer; in reach are: {', '.join(discover()) or 'none'}. Remedy: check power, "
             "cable and address; one program at a time can control a camera"
@@ -131,13 +137,8 @@ class VivaGrabber:
         if wanted in entries:
             self._camera.set_enum("PixelFormat", wanted)
         elif not any(entry.startswith(("Mono10", "Mono12", "Mono14", "Mono16")) for entry in entries):
-            raise InputError(
-                "the camera has no deep Mono format",
-                key="pixel_format",
-                value=wanted,
-                allowed=", ".join(entries),
-                remedy="take a camera that sends more than 8 bits",
-            )
+            raise InputError("the camera has no deep Mono format", key="pixel_format", value=wanted,
+                             allowed=", ".join(entries), remedy="take a camera with more than 8 bits")  # fmt: skip
         # Some cameras send a format that their own XML leaves out: the frames say what they are, and `grab` checks it.
         self._format = wanted
 
@@ -168,31 +169,23 @@ class VivaGrabber:
         except self._vg.GenicamError as error:
             raise CameraError(f"camera {self._address}: {error}") from error
 
-    def grab(self, timeout_s: float) -> Frame:
+    def grab(self, timeout_s: float) -> CameraFrame:
         """One frame by software trigger."""
-        try:
+        with self._errors(CABLE):
             self._camera.trigger_software()
             frame = self._next(timeout_s)
             if not frame.is_complete:
                 raise FrameLost(f"{frame.status.value}, {frame.missing_packets or 'unknown'} packets missing")
             if frame.pixel_format != self._format:
-                sent = frame.pixel_format
-                raise InputError(
-                    "the camera sends another format",
-                    key="pixel_format",
-                    value=self._format,
-                    allowed=sent,
-                    remedy="name the format that it sends",
-                )
+                raise InputError("the camera sends another format", key="pixel_format", value=self._format,
+                                 allowed=frame.pixel_format, remedy="name the format that it sends")  # fmt: skip
             exposure = float(self._camera.chunk_features(frame)["ChunkExposureTime"]) * 1e-6 if self._chunks else None
             pixels = np.asarray(frame.to_numpy(), np.uint16)
-        except self._vg.GenicamError as error:
-            raise CameraError(f"camera {self._address}: {error}. Remedy: check its cable and power") from error
         if frame.ts_dev is None:
             raise CameraError(
                 f"camera {self._address} sends no timestamps. Remedy: take one that does, or newer firmware"
             )
-        return Frame(pixels, frame.ts_dev * self._tick_s, exposure)
+        return CameraFrame(pixels, frame.ts_dev * self._tick_s, exposure)
 
     def _next(self, timeout_s: float) -> Any:
         end = time.monotonic() + timeout_s
@@ -212,13 +205,11 @@ class VivaGrabber:
 
     def restart(self) -> None:
         """Stop and start the acquisition."""
-        try:
+        with self._errors(CABLE):
             stream, self._stream = self._stream, None
             if stream is not None:
                 stream.__exit__(None, None, None)
             self._open_stream()
-        except self._vg.GenicamError as error:
-            raise CameraError(f"camera {self._address}: {error}. Remedy: check its cable and power") from error
 
     def close(self) -> None:
         """Stop the acquisition and give control back."""

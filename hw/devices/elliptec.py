@@ -8,13 +8,14 @@ that answer is old.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
 
-from hw.base.errors import DeviceFault, Garbled, NoAnswer, WrongDevice
-from hw.devices.turning import POLL_S, degrees_of, not_reached
-from hw.serial.link import Inbox, LineFramer, Link, persist
+from hw.base.errors import DeviceFault, NoAnswer
+from hw.devices.turning import BLOCKED, POLL_S, degrees_of, not_reached
+from hw.serial.link import Inbox, LineFramer, Link, asked
 
 T = TypeVar("T")
 
@@ -66,20 +67,12 @@ class ElliptecTable:
         line = self._inbox.next(lambda m: m[:3] in wanted, timeout_s)
         self._owed = line is None
         if line is None:
-            problem = f"did not answer {a + command!r} within {timeout_s:g} s"
-            raise NoAnswer(self.link.url, self.link.device, problem, "check cable and power of the turntable")
+            raise self.link.no_answer(repr(a + command), timeout_s)
         return line[1:]
 
     def _ask(self, command: str, expected: str, parse: Callable[[str], T], timeout_s: float = ANSWER_S) -> T:
-        def attempt() -> T:
-            answer = self._once(command, expected, timeout_s)
-            try:
-                return parse(answer)
-            except ValueError as error:
-                problem = f"answered {self._address + command!r} with {answer[:40]!r}"
-                raise Garbled(self.link.url, self.link.device, problem, "check cable and grounding") from error
-
-        return persist(attempt, self._resynchronise)
+        once = partial(self._once, command, expected, timeout_s)
+        return asked(self.link, repr(self._address + command), once, parse, self._resynchronise)
 
     def _resynchronise(self) -> None:
         """Answers come in order: once the stage has said who it is, no older answer can come any more."""
@@ -93,19 +86,17 @@ class ElliptecTable:
         try:
             answer = self._ask("in", "IN", str)
         except NoAnswer as error:
-            raise self._wrong(f"is not an Elliptec stage: asked {self._address}in, {self.link.heard()}") from error
+            raise self.link.wrong_device(
+                f"is not an Elliptec stage: asked {self._address}in, {self.link.heard()}"
+            ) from error
         try:
             kind, serial, travel, pulses = int(answer[2:4], 16), answer[4:12], int(answer[20:24], 16), answer[24:32]
             steps = int(pulses, 16)
         except ValueError as error:
-            raise self._wrong(f"is not an Elliptec stage: it answered {answer[:40]!r}") from error
+            raise self.link.wrong_device(f"is not an Elliptec stage: it answered {answer[:40]!r}") from error
         if kind not in ROTARY or travel != 360:
-            raise self._wrong(f"is not a rotation stage: an ELL{kind} with a travel of {travel} answered")
+            raise self.link.wrong_device(f"is not a rotation stage: an ELL{kind} with a travel of {travel} answered")
         return ROTARY[kind], serial, steps
-
-    def _wrong(self, problem: str) -> WrongDevice:
-        remedy = "check the ports in the rig file; `disco-twin rig probe` says which device is where"
-        return WrongDevice(self.link.url, self.link.device, problem, remedy)
 
     # ---- moving
 
@@ -129,8 +120,7 @@ class ElliptecTable:
             if abs(away) <= max(2, round(self._pulses / 3600)):  # 0.1 deg: what the stage repeats to
                 return
         problem = f"stopped at {found / self._pulses * 360.0:.2f} deg instead of {angle_deg:.2f} deg"
-        remedy = "check that nothing blocks the table, then home it again"
-        raise DeviceFault(self.link.url, self.link.device, problem, remedy)
+        raise self.link.error(DeviceFault, problem, BLOCKED)
 
     def _turn(self, command: str, angle_deg: float, end: float, limit_s: float) -> None:
         """Start, and wait for the answer at the end of the motion; if it does not come, ask."""
@@ -148,8 +138,7 @@ class ElliptecTable:
         if answer.startswith("GS") and answer != "GS00":
             code = _code(answer)
             problem = f"reports {CODES.get(code, f'error {code}')}"
-            remedy = "check that nothing blocks the table, then home it again"
-            raise DeviceFault(self.link.url, self.link.device, problem, remedy)
+            raise self.link.error(DeviceFault, problem, BLOCKED)
 
     def _position(self) -> int:
         """Pulses from zero, signed."""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from hw.base.errors import DeviceRefused, Garbled, InputError, NoAnswer, WrongDevice
 from hw.safety.signals import uninterrupted
-from hw.serial.link import Inbox, Link, persist
+from hw.serial.link import Inbox, Link, asked, persist
 
 BAUD = 57_600
 BOOT_S = 2.0  # opening the port resets the board
@@ -67,7 +67,7 @@ class MirrorBoard:
             got = self._receive(len(echo) + answer, command)
             if got[: len(echo)] != echo:
                 problem = f"answered {command.hex(' ')} with {got.hex(' ')} instead of {echo.hex(' ')}"
-                raise Garbled(self.link.url, self.link.device, problem, "check cable and grounding of the board")
+                raise self.link.error(Garbled, problem, "check cable and grounding of the board")
             self._owed = False
             return got[len(echo) :]
 
@@ -83,8 +83,7 @@ class MirrorBoard:
         while len(got) < size:
             byte = self._inbox.next(lambda _: True, end - self.link.clock.now())
             if byte is None:
-                problem = f"did not answer {command.hex(' ')} within {ANSWER_S:g} s"
-                raise NoAnswer(self.link.url, self.link.device, problem, "check cable and power of the board")
+                raise self.link.no_answer(command.hex(" "), ANSWER_S)
             got.append(byte)
         return bytes(got)
 
@@ -100,36 +99,27 @@ class MirrorBoard:
         try:
             self._exchange(bytes([IDENTIFY]), IDENTITY)
         except (NoAnswer, Garbled) as error:
-            raise self._wrong(f"is not an MM-Ard board: asked {IDENTIFY}, {self.link.heard()}") from error
+            raise self.link.wrong_device(f"is not an MM-Ard board: asked {IDENTIFY}, {self.link.heard()}") from error
         version = self._line(VERSION)
         channels = self._exchange(bytes([CHANNELS]), bytes([CHANNELS]), 1)[0] if version >= 5 else 0
         if channels < 2:
             problem = f"(MM-Ard version {version}) was built for {channels} DAC channels and would ignore the mirrors"
             remedy = "build AOTFcontroller.ino, version 5 or newer, with TLV5618 defined"
-            raise WrongDevice(self.link.url, self.link.device, problem, remedy)
+            raise self.link.error(WrongDevice, problem, remedy)
         return version
 
     def _line(self, command: int) -> int:
         """A number in text, ended by CR LF."""
 
-        def attempt() -> int:
+        def once() -> bytes:
             self._inbox.clear()
             self.link.write(bytes([command]))
             text = self._receive(3, bytes([command]))
             while not text.endswith(b"\r\n"):
                 text += self._receive(1, bytes([command]))
-            try:
-                return int(text)
-            except ValueError as error:
-                problem = f"answered {command} with {text!r}, which is no number"
-                remedy = "check cable and grounding of the board"
-                raise Garbled(self.link.url, self.link.device, problem, remedy) from error
+            return text
 
-        return persist(attempt, self._resynchronise)
-
-    def _wrong(self, problem: str) -> WrongDevice:
-        remedy = "check the ports in the rig file; `disco-twin rig probe` says which device is where"
-        return WrongDevice(self.link.url, self.link.device, problem, remedy)
+        return asked(self.link, str(command), once, int, self._resynchronise)
 
     # ---- what it does
 
@@ -164,7 +154,7 @@ class MirrorBoard:
             self.shut()
         problem = f"has its TTL lines at {found:06b} instead of {pattern:06b}"
         remedy = "switch the board off and on; blanking and trigger modes must be off"
-        raise DeviceRefused(self.link.url, self.link.device, problem, remedy)
+        raise self.link.error(DeviceRefused, problem, remedy)
 
     def shut(self) -> None:
         """Every line low."""

@@ -12,12 +12,13 @@ import logging
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NoReturn, TypeVar
 
-from hw.base.errors import DeviceError, DeviceFault, DeviceRefused, Garbled, NoAnswer, WrongDevice
+from hw.base.errors import DeviceError, DeviceFault, DeviceRefused, NoAnswer
 from hw.devices.omicron_protocol import FAULTS, LEVELS, Mode, OmicronFramer, Status
 from hw.safety.signals import uninterrupted
-from hw.serial.link import Inbox, Link, persist
+from hw.serial.link import Inbox, Link, asked
 
 log = logging.getLogger(__name__)
 
@@ -86,16 +87,8 @@ class OmicronLaser:
     def _ask(self, letters: str, arguments: str, parse: Callable[[str], T]) -> T:
         """Ask until the answer can be parsed (ValueError: it cannot)."""
 
-        def attempt() -> T:
-            answer = self._once(letters, arguments)
-            try:
-                return parse(answer)
-            except ValueError as error:
-                problem = f"answered ?{letters}{arguments} with {answer[:40]!r}, which makes no sense"
-                remedy = "check cable, baud rate and grounding of the laser"
-                raise Garbled(self.link.url, self.name, problem, remedy) from error
-
-        return persist(attempt, self._resynchronise)
+        once = partial(self._once, letters, arguments)
+        return asked(self.link, f"?{letters}{arguments}", once, parse, self._resynchronise)
 
     def _once(self, letters: str, arguments: str = "") -> str:
         """Ask once. Only an answer with the same letters counts."""
@@ -106,14 +99,11 @@ class OmicronLaser:
         self._owed.add(letters)
         answer = self._inbox.next(_begins("!" + letters, "!UK"), ANSWER_S)
         if answer is None:
-            problem = f"did not answer ?{letters}{arguments} within {ANSWER_S:g} s"
-            raise NoAnswer(self.link.url, self.name, problem, "check cable and power of the laser")
+            raise self.link.no_answer(f"?{letters}{arguments}", ANSWER_S)
         self._owed.discard(letters)
         self._silent = False
         if answer.startswith("!UK"):
-            raise DeviceRefused(
-                self.link.url, self.name, f"does not know ?{letters}{arguments}", "a laser of another kind?"
-            )
+            raise self.link.error(DeviceRefused, f"does not know ?{letters}{arguments}", "a laser of another kind?")
         return answer[1 + len(letters) :]
 
     def _resynchronise(self) -> None:
@@ -145,8 +135,8 @@ class OmicronLaser:
         """Say why the laser does not do what it was asked for."""
         faults = self.faults()
         if faults:
-            raise DeviceFault(self.link.url, self.name, f"{what}: {'; '.join(faults)}", "remove the cause, then reset")
-        raise DeviceRefused(self.link.url, self.name, what, "check key switch, interlock and enable pin")
+            raise self.link.error(DeviceFault, f"{what}: {'; '.join(faults)}", "remove the cause, then reset")
+        raise self.link.error(DeviceRefused, what, "check key switch, interlock and enable pin")
 
     # ---- identity
 
@@ -155,18 +145,14 @@ class OmicronLaser:
         try:
             answer = self.ask("GFw")
         except (NoAnswer, DeviceRefused) as error:
-            raise self._wrong(f"is not {expected}: asked ?GFw, {self.link.heard()}") from error
+            raise self.link.wrong_device(f"is not {expected}: asked ?GFw, {self.link.heard()}") from error
         fields = SEPARATOR.split(answer)
         if len(fields) < 3 or not fields[1].isdigit() or int(fields[1]) not in MODELS:
-            raise self._wrong(f"is not {expected}: ?GFw was answered by {answer[:40]!r}")
+            raise self.link.wrong_device(f"is not {expected}: ?GFw was answered by {answer[:40]!r}")
         found_nm = self._ask("GSI", "", lambda answer: float(SEPARATOR.split(answer)[0]))
         if abs(found_nm - wavelength_nm) > WAVELENGTH_TOLERANCE_NM:
-            raise self._wrong(f"is not {expected}: a {MODELS[int(fields[1])]} of {found_nm:g} nm answered")
+            raise self.link.wrong_device(f"is not {expected}: a {MODELS[int(fields[1])]} of {found_nm:g} nm answered")
         return LaserIdentity(MODELS[int(fields[1])], fields[2], self.ask("GSN"), found_nm, self._number("GMP"))
-
-    def _wrong(self, problem: str) -> WrongDevice:
-        remedy = "check the ports in the rig file; `disco-twin rig probe` says which device is where"
-        return WrongDevice(self.link.url, self.name, problem, remedy)
 
     # ---- state
 
@@ -196,7 +182,7 @@ class OmicronLaser:
         faults = self.faults()
         if faults:
             remedy = "remove the cause, then `reset` the laser or switch it off and on"
-            raise DeviceFault(self.link.url, self.name, "cannot emit: " + "; ".join(faults), remedy)
+            raise self.link.error(DeviceFault, "cannot emit: " + "; ".join(faults), remedy)
         status = self.status()
         for bad, problem, remedy in (
             (Status.TOGGLE_KEY in status, "waits for its key", "turn the key switch off and on"),
@@ -204,7 +190,7 @@ class OmicronLaser:
             (Status.ENABLE_PIN not in status, "is locked by its enable pin", "press the laser's shutter button"),
         ):
             if bad:
-                raise DeviceFault(self.link.url, self.name, problem, remedy)
+                raise self.link.error(DeviceFault, problem, remedy)
 
     # ---- power and emission
 
@@ -248,9 +234,9 @@ class OmicronLaser:
             if clock.now() > end:
                 said = "on" if Status.ON in status else "preheating" if Status.PREHEAT in status else "off"
                 problem = (
-                    f"was told to go off, says that it is {said} and measures {measured:.2f} mW (allowed: {most:g})"
+                    f"was told to go off, reports that it is {said} and measures {measured:.2f} mW (allowed: {most:g})"
                 )
-                raise DeviceFault(self.link.url, self.name, problem, "switch it off by its key and have it serviced")
+                raise self.link.error(DeviceFault, problem, "switch it off by its key and have it serviced")
             clock.sleep(POLL_S)
 
     def arm(self, power_mw: float) -> None:
@@ -258,7 +244,7 @@ class OmicronLaser:
         top = self.identity.max_power_mw
         if not 0.0 < power_mw <= top * (1.0 + 1e-9):
             problem = f"cannot be set to {power_mw:g} mW"
-            raise DeviceRefused(self.link.url, self.name, problem, f"ask for more than 0 and at most {top:g} mW")
+            raise self.link.error(DeviceRefused, problem, f"ask for more than 0 and at most {top:g} mW")
         if self.faults() == [FAULTS[0]]:  # an interlock was open and is closed again; whoever arms it asks anew
             log.warning("%s: %s; resetting it", self.name, FAULTS[0])
             self.reset()
@@ -271,7 +257,7 @@ class OmicronLaser:
     def emit(self) -> None:
         """Start emission; returns once the laser says that it is on. Its gate must be shut."""
         if not self.armed_mw:
-            raise DeviceRefused(self.link.url, self.name, "is not armed", "arm it with a power before it may emit")
+            raise self.link.error(DeviceRefused, "is not armed", "arm it with a power before it may emit")
         try:
             answer = self._once("LOn")
         except NoAnswer:  # not sent again: the status says whether it was understood
@@ -285,7 +271,7 @@ class OmicronLaser:
             if clock.now() > end:
                 self.require_ready()
                 problem = f"did not emit within {EMISSION_S:g} s"
-                raise NoAnswer(self.link.url, self.name, problem, "check key switch, interlock and enable pin")
+                raise self.link.error(NoAnswer, problem, "check key switch, interlock and enable pin")
             clock.sleep(POLL_S)
         self._subscriber(self.armed_mw)
 
@@ -311,7 +297,7 @@ class OmicronLaser:
             if abs(measured - self.armed_mw) <= tolerance * self.armed_mw:
                 return measured
         problem = f"emits {measured:.2f} mW instead of {self.armed_mw:g} mW (allowed: {100 * tolerance:g} % off)"
-        raise DeviceFault(self.link.url, self.name, problem, "let it warm up longer, or have the laser serviced")
+        raise self.link.error(DeviceFault, problem, "let it warm up longer, or have the laser serviced")
 
     def stop_emission(self) -> None:
         """Switch the light off; it takes seconds to come back. May be asked for at any time."""
@@ -330,7 +316,7 @@ class OmicronLaser:
         while not any(notice.startswith("RsC") for notice in self.framer.notices):
             if clock.now() > end:
                 problem = f"did not come back within {RESET_S:g} s after a reset"
-                raise NoAnswer(self.link.url, self.name, problem, "switch the laser off and on")
+                raise self.link.error(NoAnswer, problem, "switch the laser off and on")
             self._inbox.next(lambda _: False, POLL_S)
         self._owed.clear()
         self.force_off()
@@ -372,7 +358,7 @@ class OmicronLaser:
                 self._refuse(f"refused ?SLP{level:03X}")
         if round(self.level() * LEVELS) != level:
             problem = f"did not keep level {level:03X} in {ATTEMPTS} attempts"
-            raise DeviceRefused(self.link.url, self.name, problem, "reset the laser, or switch it off and on")
+            raise self.link.error(DeviceRefused, problem, "reset the laser, or switch it off and on")
 
     def _set_mode(self, add: int = 0, clear: int = 0) -> None:
         before = self.mode()
@@ -381,7 +367,7 @@ class OmicronLaser:
             self._set("SOM", f"{wanted:04X}")
         if self.mode() != wanted:
             problem = f"did not keep mode {wanted:04X}"
-            raise DeviceRefused(self.link.url, self.name, problem, "reset the laser, or switch it off and on")
+            raise self.link.error(DeviceRefused, problem, "reset the laser, or switch it off and on")
 
 
 def _begins(*prefixes: str) -> Callable[[str], bool]:

@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
-from hw.base.errors import DeviceFault, DeviceRefused, Garbled, NoAnswer, WrongDevice
-from hw.serial.link import Inbox, LineFramer, Link, persist
+from hw.base.errors import DeviceFault, DeviceRefused, NoAnswer
+from hw.serial.link import Inbox, LineFramer, Link, asked
 
 T = TypeVar("T")
 
@@ -43,12 +44,11 @@ class OphirMeter:
         line = self._inbox.next(lambda m: m[:1] in "*?" and (identity or not self._is_identity(m)), ANSWER_S)
         self._owed = line is None
         if line is None:
-            problem = f"did not answer ${command} within {ANSWER_S:g} s"
-            raise NoAnswer(self.link.url, self.link.device, problem, "check cable, power and baud rate of the meter")
+            raise self.link.no_answer(f"${command}", ANSWER_S)
         # a power after `?` is a garbled `*`, not a refusal
         if line.startswith("?") and not POWER.fullmatch(line[1:].strip()):
             problem = f"refused ${command} ({line[1:].strip()})"
-            raise DeviceRefused(self.link.url, self.link.device, problem, "check that a sensor head is plugged in")
+            raise self.link.error(DeviceRefused, problem, "check that a sensor head is plugged in")
         return line[1:].strip() if line.startswith("*") else line
 
     def _is_identity(self, line: str) -> bool:
@@ -61,29 +61,17 @@ class OphirMeter:
         self._owed = self._inbox.next(self._is_identity, RESYNC_S) is None
 
     def _ask(self, command: str, parse: Callable[[str], T]) -> T:
-        def attempt() -> T:
-            answer = self._once(command)
-            try:
-                return parse(answer)
-            except ValueError as error:
-                problem = f"answered ${command} with {answer[:40]!r}, which makes no sense"
-                raise Garbled(self.link.url, self.link.device, problem, "check cable and baud rate") from error
-
-        return persist(attempt, self._resynchronise)
+        return asked(self.link, f"${command}", partial(self._once, command), parse, self._resynchronise)
 
     def _identify(self) -> str:
         try:
             answer = self._ask("II", str)
         except (NoAnswer, DeviceRefused) as error:
-            raise self._wrong(f"is not an Ophir meter: asked $II, {self.link.heard()}") from error
+            raise self.link.wrong_device(f"is not an Ophir meter: asked $II, {self.link.heard()}") from error
         model = answer.split()[0].upper() if answer else ""
         if model not in METERS:
-            raise self._wrong(f"is not an Ophir meter that is known here: it answered {answer[:40]!r}")
+            raise self.link.wrong_device(f"is not an Ophir meter that is known here: it answered {answer[:40]!r}")
         return model
-
-    def _wrong(self, problem: str) -> WrongDevice:
-        remedy = "check the ports in the rig file; `disco-twin rig probe` says which device is where"
-        return WrongDevice(self.link.url, self.link.device, problem, remedy)
 
     def read(self) -> float:
         """Watts on the sensor."""
@@ -97,8 +85,7 @@ class OphirMeter:
 
         value = self._ask("SP", watts)
         if math.isinf(value):
-            problem = "is over its range"
-            raise DeviceFault(self.link.url, self.link.device, problem, "choose a higher range or attenuate the beam")
+            raise self.link.error(DeviceFault, "is over its range", "choose a higher range or attenuate the beam")
         return value
 
     def close(self) -> None:

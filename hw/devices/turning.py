@@ -10,6 +10,7 @@ from hw.base.errors import NoAnswer
 from hw.serial.link import Link
 
 POLL_S = 0.1
+BLOCKED = "check that nothing blocks the table, then home it again"
 
 
 class TurntableDriver(Protocol):
@@ -38,4 +39,4 @@ def degrees_of(angle_rad: float) -> float:
 def not_reached(link: Link, angle_deg: float, limit_s: float, where: str) -> NoAnswer:
     """The error of a turntable that did not arrive in time."""
     problem = f"did not reach {angle_deg:.1f} deg in {limit_s:g} s ({where})"
-    return NoAnswer(link.url, link.device, problem, "check that nothing blocks the table, then home it again")
+    return link.error(NoAnswer, problem, BLOCKED)

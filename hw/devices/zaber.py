@@ -13,19 +13,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw.base.errors import DeviceError, DeviceFault, DeviceRefused, Garbled, NoAnswer, WrongDevice
-from hw.devices.turning import POLL_S, degrees_of, not_reached
-from hw.serial.link import Inbox, Link, persist
+from hw.base.errors import DeviceError, DeviceFault, DeviceRefused, NoAnswer
+from hw.devices.turning import BLOCKED, POLL_S, degrees_of, not_reached
+from hw.serial.link import Inbox, Link, asked, persist
 
 log = logging.getLogger(__name__)
 
 BAUD = 115_200
 ANSWER_S = 0.5
 HOME_S = 60.0
+KEYS = "ports and microsteps_per_deg"
 FAULTS = {
     "FD": ("has switched its driver off", "let it cool down, then switch it off and on"),
-    "FQ": ("was stopped by its encoder", "check that nothing blocks the table, then home it again"),
-    "FS": ("has stalled", "check that nothing blocks the table, then home it again"),
+    "FQ": ("was stopped by its encoder", BLOCKED),
+    "FS": ("has stalled", BLOCKED),
     "FH": ("is held by its emergency stop", "release the emergency stop, then home it again"),
     "NI": ("was interrupted in a move", "keep hands off its knob and commands"),
 }
@@ -123,8 +124,7 @@ class ZaberTable:
             lambda r: (r.device, r.id) == (self._device, self._id) and r.checked >= self._checked, ANSWER_S
         )
         if reply is None:
-            problem = f"did not answer {command or 'a status request'!r} within {ANSWER_S:g} s"
-            raise NoAnswer(self.link.url, self.link.device, problem, "check cable and power of the turntable")
+            raise self.link.no_answer(repr(command or "a status request"), ANSWER_S)
         return reply
 
     def ask(self, command: str) -> Reply:
@@ -132,26 +132,22 @@ class ZaberTable:
         return persist(lambda: self._once(command), self._inbox.clear)
 
     def _number(self, setting: str) -> float:
-        def attempt() -> float:
+        def once() -> str:
             reply = self._once(f"get {setting}")
             if not reply.accepted:
                 raise self._refused(f"get {setting}", reply)
-            try:
-                return float(reply.data.split()[0])
-            except ValueError as error:
-                problem = f"answered 'get {setting}' with {reply.data[:40]!r}"
-                raise Garbled(self.link.url, self.link.device, problem, "check cable and grounding") from error
+            return reply.data
 
-        return persist(attempt, self._inbox.clear)
+        return asked(self.link, f"'get {setting}'", once, lambda data: float(data.split()[0]), self._inbox.clear)
 
     def _refused(self, command: str, reply: Reply) -> DeviceRefused | DeviceFault:
         if reply.warning in FAULTS:
-            return DeviceFault(self.link.url, self.link.device, *FAULTS[reply.warning])
+            return self.link.error(DeviceFault, *FAULTS[reply.warning])
         if reply.warning in LOST:
             problem = f"does not know where it stands ({reply.warning}) and refused {command!r}"
-            return DeviceFault(self.link.url, self.link.device, problem, "its power was cut or it is new: home it")
+            return self.link.error(DeviceFault, problem, "its power was cut or it is new: home it")
         problem = f"refused {command!r} ({reply.data})"
-        return DeviceRefused(self.link.url, self.link.device, problem, "check its settings with Zaber Launcher")
+        return self.link.error(DeviceRefused, problem, "check its settings with Zaber Launcher")
 
     # ---- identity
 
@@ -159,7 +155,9 @@ class ZaberTable:
         try:
             self.ask("")
         except NoAnswer as error:
-            raise self._wrong(f"is not a Zaber stage: asked for its status, {self.link.heard()}") from error
+            raise self.link.wrong_device(
+                f"is not a Zaber stage: asked for its status, {self.link.heard()}", KEYS
+            ) from error
         self._checked = self.ask("set comm.checksum 1").accepted
         if not self._checked:
             log.warning("%s: its firmware sends no checksums; a garbled digit may go unnoticed", self.link.device)
@@ -167,12 +165,9 @@ class ZaberTable:
         expected = round(360.0 * self.microsteps_per_deg)
         found = turn.data.split()[0] if turn.accepted else "none (a linear stage?)"
         if found != str(expected):
-            raise self._wrong(f"has {found} microsteps a turn instead of {expected} (microsteps_per_deg)")
+            problem = f"has {found} microsteps a turn instead of {expected} (microsteps_per_deg)"
+            raise self.link.wrong_device(problem, KEYS)
         return self.ask("get system.serial").data
-
-    def _wrong(self, problem: str) -> WrongDevice:
-        remedy = "check ports and microsteps_per_deg in the rig file; `disco-twin rig probe` says which device is where"
-        return WrongDevice(self.link.url, self.link.device, problem, remedy)
 
     # ---- moving
 
@@ -190,8 +185,7 @@ class ZaberTable:
         found = self._number("pos")
         if abs(found - target) > 1:
             problem = f"stopped at {found / self.microsteps_per_deg:.3f} deg instead of {angle:.3f} deg"
-            remedy = "check that nothing blocks the table, then home it again"
-            raise DeviceFault(self.link.url, self.link.device, problem, remedy)
+            raise self.link.error(DeviceFault, problem, BLOCKED)
 
     def _start(self, command: str) -> None:
         reply = self.ask(command)

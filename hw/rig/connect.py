@@ -20,7 +20,6 @@ from hw.base.errors import DeviceError, DeviceFault, InputError
 from hw.devices.elliptec import BAUD as ELLIPTEC_BAUD
 from hw.devices.elliptec import ElliptecTable
 from hw.devices.mm_ard import BAUD as BOARD_BAUD
-from hw.devices.mm_ard import MirrorBoard
 from hw.devices.omicron import OFF_SHARE, OmicronLaser
 from hw.devices.ophir import BAUD as OPHIR_BAUD
 from hw.devices.ophir import OphirMeter
@@ -79,18 +78,14 @@ class Connector:
             remedy = "name the device's port, or hand in what stands in for it"
             raise InputError("nothing emulates this device here", file=self.file.path, key=key, value=port,
                              remedy=remedy)  # fmt: skip
-        try:
-            log = None if self.logs is None else ByteLog(self.logs / f"{name}.log")
+        log = None if self.logs is None else ByteLog(self.logs / f"{name}.log")
+        with keys_named(self.file):
             link = Link(url, baud, device, self.clock, log)
             try:
                 return driver(link)
             except BaseException:
                 link.close()
                 raise
-        except DeviceError as error:
-            if port == EMULATED:
-                raise
-            raise _named(self.file, error, key, port) from error.__cause__
 
     def _subscriber(self, port: str) -> Subscriber:
         """Emulated devices move the simulation by themselves; it follows the real ones."""
@@ -140,11 +135,12 @@ class Connector:
             raise InputError("the rig file has no power meter", file=self.file.path, key="power_meter", remedy=remedy)
         return self._opened("power_meter.port", OPHIR_BAUD, "power meter", "power_meter", OphirMeter)
 
-    def board(self) -> Board:
+    def board(self) -> LimitedBoard:
         """The board's driver, which keeps the mirrors within their limits; connecting shuts every line."""
         device = self.file.board
-        board = self._opened("board.port", BOARD_BAUD, "mirror board", "board", MirrorBoard)
-        return LimitedBoard(board, (device.limits_u, device.limits_v), self._subscriber(device.port))
+        limits, subscriber = (device.limits_u, device.limits_v), self._subscriber(device.port)
+        driver = partial(LimitedBoard, limits=limits, subscriber=subscriber)
+        return self._opened("board.port", BOARD_BAUD, "mirror board", "board", driver)
 
     def table(self) -> TurntableDriver:
         """The turntable's driver, in angles of the rig."""
@@ -260,9 +256,4 @@ def keys_named(file: RigFile) -> Iterator[None]:
         port = file.board.port if error.port == "board" else error.port.removeprefix(PREFIX)
         if error.key is not None or port not in ports:
             raise
-        raise _named(file, error, ports[port], port) from error.__cause__
-
-
-def _named(file: RigFile, error: DeviceError, key: str, port: str) -> DeviceError:
-    named = error.set_by(key, port)
-    return named if file.path is None else named.within(file.path)
+        raise error.set_by(ports[port], port, file.path) from error.__cause__

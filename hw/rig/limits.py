@@ -5,14 +5,14 @@ What the devices of a rig do is also told to a `Subscriber`: simulated cameras s
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from hw.base.errors import InputError
+from hw.devices.mm_ard import MirrorBoard
 from hw.devices.turning import TurntableDriver
-from hw.rig.drivers import Board
+from hw.serial.link import Link
 
 
 class Subscriber:
@@ -31,24 +31,19 @@ class Subscriber:
         """The turntable stands at this angle of the rig."""
 
 
-@dataclass
-class LimitedBoard:
+class LimitedBoard(MirrorBoard):
     """A board whose mirrors stay within the limits of the rig file."""
 
-    board: Board
-    limits: tuple[tuple[int, int], tuple[int, int]]
-    subscriber: Subscriber
-
-    def when_lost(self, action: Callable[[], None]) -> None:
-        """What to do when an answer was lost, before anything is repeated."""
-        self.board.when_lost(action)
+    def __init__(self, link: Link, limits: tuple[tuple[int, int], tuple[int, int]], subscriber: Subscriber) -> None:
+        self._limits, self._subscriber = limits, subscriber
+        super().__init__(link)
 
     def set_mirrors(self, u: int, v: int) -> None:
         """Both mirrors.
 
         Raises: InputError outside the limits, before anything moves.
         """
-        for name, value, (low, high) in zip("uv", (u, v), self.limits, strict=True):
+        for name, value, (low, high) in zip("uv", (u, v), self._limits, strict=True):
             if not low <= value <= high:
                 raise InputError(
                     "this mirror step is outside the rig's limits",
@@ -57,39 +52,20 @@ class LimitedBoard:
                     allowed=f"{low} to {high}",
                     remedy="widen the limits in the rig file, or aim the scene's projector so that it needs less",
                 )
-        self.board.set_mirrors(u, v)
-        self.subscriber.mirrors(u, v)
+        super().set_mirrors(u, v)
+        self._subscriber.mirrors(u, v)
 
     def set_lines(self, pattern: int) -> None:
         """The TTL lines."""
-        self.board.set_lines(pattern)
-        self.subscriber.lines(pattern)
-
-    def lines(self) -> int:
-        """The TTL lines as they are."""
-        return self.board.lines()
+        super().set_lines(pattern)
+        self._subscriber.lines(pattern)
 
     def darken(self) -> None:
         """Every line low, without waiting for the answer."""
-        self._low(self.board.darken)
-
-    def shut(self) -> None:
-        """Every line low."""
-        self._low(self.board.shut)
-
-    def counts(self, pin: int) -> int:
-        """The converter's value at a pin."""
-        return self.board.counts(pin)
-
-    def close(self) -> None:
-        """Shut, and give the port back."""
-        self._low(self.board.close)
-
-    def _low(self, act: Callable[[], None]) -> None:
         try:
-            act()
+            super().darken()
         finally:
-            self.subscriber.lines(0)
+            self._subscriber.lines(0)
 
 
 @dataclass

@@ -8,7 +8,7 @@ sees what the emulated and real devices light: any mixture works.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr
 
@@ -27,28 +27,17 @@ Response = Annotated[float, Field(ge=1, le=1e24)]
 TtlLine = Annotated[int, Field(ge=0, le=LINES - 1)]
 Step = Annotated[int, Field(ge=0, lt=PROJECTOR_STEPS)]
 PRINTABLE = r"^[^\x00-\x1f\x7f]*$"  # no control characters
+
+
+def _text(most: int, description: str) -> Any:
+    return Field(min_length=1, max_length=most, pattern=PRINTABLE, description=description)
+
+
 Port = Annotated[
-    str,
-    Field(
-        min_length=1,
-        max_length=200,
-        pattern=PRINTABLE,
-        description="a path as in /dev/serial/by-id/..., or `emulated`; at most 200 characters, no control characters",
-    ),
+    str, _text(200, "a path as in /dev/serial/by-id/..., or `emulated`; at most 200 characters, no control characters")
 ]
-Address = Annotated[
-    str,
-    Field(
-        min_length=1,
-        max_length=200,
-        pattern=PRINTABLE,
-        description="an IP address as in 192.168.1.20, or the serial number of a USB3 camera",
-    ),
-]
-Name = Annotated[
-    str,
-    Field(min_length=1, max_length=64, pattern=PRINTABLE, description="1 to 64 characters, no control characters"),
-]
+Address = Annotated[str, _text(200, "an IP address as in 192.168.1.20, or the serial number of a USB3 camera")]
+Name = Annotated[str, _text(64, "1 to 64 characters, no control characters")]
 
 
 class LaserDevice(Strict):

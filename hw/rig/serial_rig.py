@@ -179,7 +179,7 @@ class SerialRig:
             raise Refused(f"the {what} must not move while the gate of laser {self.open_gate} is open")
 
 
-# ---- the rig's parts as `hw.interface` names them
+# ---- its parts, as `hw.interface` names them
 
 
 @dataclass

@@ -111,6 +111,10 @@ class ReplayPeer:
         """Nothing to do."""
 
     @property
+    def _next(self) -> Event | None:
+        return self._events[self._place] if self._place < len(self._events) else None
+
+    @property
     def finished(self) -> bool:
         """Whether every byte of the log has been exchanged."""
         return self._place == len(self._events) and not self._sent
@@ -119,7 +123,7 @@ class ReplayPeer:
         """Compare with what was sent when the log was written."""
         self._sent += data
         while self._sent:
-            event = self._events[self._place] if self._place < len(self._events) else None
+            event = self._next
             if event is None or event.mark == "<":
                 raise DiscoError(f"replay: {self._sent!r} was sent where the log has {event}")
             size = min(len(event.data), len(self._sent))
@@ -130,8 +134,7 @@ class ReplayPeer:
 
     def deliver(self, size: int, timeout_s: float) -> bytes:
         """What the log has next, at its time; nothing within the timeout if it is the computer's turn."""
-        now = self._clock.now()
-        event = self._events[self._place] if self._place < len(self._events) else None
+        now, event = self._clock.now(), self._next
         if event is None or event.mark == ">" or event.time_s > now + timeout_s:
             self._clock.sleep(timeout_s)
             return b""
@@ -141,7 +144,7 @@ class ReplayPeer:
 
     def waiting(self) -> int:
         """Bytes of the next event, if it is the device's and due."""
-        event = self._events[self._place] if self._place < len(self._events) else None
+        event = self._next
         due = event is not None and event.mark == "<" and event.time_s <= self._clock.now()
         return len(event.data) if event is not None and due else 0
 

@@ -1,7 +1,7 @@
-"""The link to a device: opens its port, sends and receives bytes, knows how long to wait, and writes the byte log.
+"""The link to a device: opens its port, sends and receives bytes, waits within limits, and writes the byte log.
 
 Every protocol has a framer, a pure function object from bytes to messages, and an `Inbox` in front of the link that
-waits for messages. What a message means is the drivers' business (`hw.devices`).
+waits for messages. Drivers (`hw.devices`) interpret the messages; `asked` is a question that may be repeated.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Generic, Protocol, TypeVar
 import serial
 
 from hw.base.clock import Clock
-from hw.base.errors import Garbled, NoAnswer, SwitchedOff, Unplugged
+from hw.base.errors import DeviceError, Garbled, NoAnswer, SwitchedOff, Unplugged, WrongDevice
 from hw.safety.guard import FAILURES, GuardClosed
 from hw.safety.ports.protocol_guard import Serial as GuardedPort
 from hw.serial.bytelog import ByteLog
@@ -24,6 +24,8 @@ from hw.serial.bytelog import ByteLog
 log = logging.getLogger(__name__)
 
 M = TypeVar("M")
+A = TypeVar("A")
+E = TypeVar("E", bound=DeviceError)
 
 SLICE_S = 0.02  # a port is never waited for longer at a time: the precision of time limits
 WRITE_TIMEOUT_S = 1.0
@@ -40,21 +42,13 @@ FORBIDDEN = (
 IN_USE = ("another program uses it", "end that program (`fuser -v` and the port names it)")
 NO_PORT = ("it is no serial port", f"name the device's port: {LISTED}")
 NOBODY = ("nobody answers there", "start the program that serves the port, or correct the port")
-TROUBLE = {
-    errno.ENOENT: NOT_THERE,
-    errno.ENXIO: NOT_THERE,
-    errno.ENODEV: NOT_THERE,
-    errno.EIO: NOT_THERE,
-    errno.ELOOP: NOT_THERE,
-    errno.EACCES: FORBIDDEN,
-    errno.EPERM: FORBIDDEN,
-    errno.EBUSY: IN_USE,
-    errno.EAGAIN: IN_USE,
-    errno.ENOTTY: NO_PORT,
-    errno.EISDIR: NO_PORT,
-    errno.ENOTDIR: NO_PORT,
-    errno.ECONNREFUSED: NOBODY,
-}
+TROUBLE = (
+    dict.fromkeys((errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.EIO, errno.ELOOP), NOT_THERE)
+    | dict.fromkeys((errno.EACCES, errno.EPERM), FORBIDDEN)
+    | dict.fromkeys((errno.EBUSY, errno.EAGAIN), IN_USE)
+    | dict.fromkeys((errno.ENOTTY, errno.EISDIR, errno.ENOTDIR), NO_PORT)
+    | {errno.ECONNREFUSED: NOBODY}
+)
 NUMBER = re.compile(r"\[Errno (\d+)\]|\((\d+), '")  # pyserial and guards give it as text alone
 
 GUARD_REMEDY = "see that the laser is off, then repeat the same command"
@@ -99,6 +93,10 @@ class Link:
     """An open port. `device` is what the rig calls the device, and begins every error."""
 
     def __init__(self, url: str, baud: int, device: str, clock: Clock, log: ByteLog | None = None) -> None:
+        """Open the port.
+
+        Raises: Unplugged where it cannot be opened, as every method does from the moment that it fails.
+        """
         self.url, self.device, self.clock, self._log = url, device, clock, log
         self._heard = b""
         self._gone = False
@@ -142,6 +140,19 @@ class Link:
     def heard(self) -> str:
         """What has come since the last question, in words: for errors about devices that speak something else."""
         return f"{self._heard!r} came" if self._heard else "nothing answered"
+
+    def error(self, kind: type[E], problem: str, remedy: str) -> E:
+        """An error of this device."""
+        return kind(self.url, self.device, problem, remedy)
+
+    def wrong_device(self, problem: str, keys: str = "the ports") -> WrongDevice:
+        """Another device than the driver's is at the port. keys: of the rig file, to be checked."""
+        remedy = f"check {keys} in the rig file; `disco-twin rig probe` lists which device is where"
+        return self.error(WrongDevice, problem, remedy)
+
+    def no_answer(self, asked: object, limit_s: float) -> NoAnswer:
+        """Nothing came in time."""
+        return self.error(NoAnswer, f"did not answer {asked} within {limit_s:g} s", "check its cable and power")
 
     def require_guard(self) -> None:
         """Refuse to go on if the port had a guard and has none any more; it takes no word to the device."""
@@ -227,6 +238,22 @@ class Inbox(Generic[M]):
                 return False
         self.clear()
         return True
+
+
+def asked(
+    link: Link, question: str, ask_once: Callable[[], A], parse: Callable[[A], M], recover: Callable[[], None]
+) -> M:
+    """The answer to what may be asked twice, parsed (ValueError: it cannot be); repeated as by `persist`."""
+
+    def attempt() -> M:
+        answer = ask_once()
+        try:
+            return parse(answer)
+        except ValueError as error:
+            problem = f"answered {question} with {str(answer)[:40]!r}, which makes no sense"
+            raise link.error(Garbled, problem, "check its cable, baud rate and grounding") from error
+
+    return persist(attempt, recover)
 
 
 def persist(attempt: Callable[[], M], recover: Callable[[], None], tries: int = 3) -> M:

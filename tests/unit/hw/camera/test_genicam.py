@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from hw.base.errors import InputError
 from hw.camera.bracket import Bracket
-from hw.camera.genicam import ATTEMPTS, CameraError, Frame, FrameLost, GenicamCamera
+from hw.camera.genicam import ATTEMPTS, CameraError, CameraFrame, FrameLost, GenicamCamera
 from hw.record import Sensor, to_radiance
 
 SIZE = (496, 768)
@@ -114,16 +114,16 @@ class Fake:
         self.made = round(seconds * 1e6 / self.step_us) * self.step_us * 1e-6
         return self.made
 
-    def grab(self, timeout_s: float) -> Frame:
+    def grab(self, timeout_s: float) -> CameraFrame:
         assert timeout_s > self.made
         self.triggers += 1
         fault = self.faults.get(self.triggers)
         if isinstance(fault, Exception):
             raise fault
         ramp = np.minimum(4095, 64 + self.made * 1e6 * np.linspace(0, 5, 60)).astype(np.uint16).reshape(6, 10)
-        if isinstance(fault, Frame):
+        if isinstance(fault, CameraFrame):
             return fault
-        return Frame(ramp, self.triggers * 0.1, self.made)
+        return CameraFrame(ramp, self.triggers * 0.1, self.made)
 
     def restart(self) -> None:
         self.restarts += 1
@@ -137,7 +137,7 @@ def camera(grabber: Fake) -> GenicamCamera:
 
 def test_lost_frames_and_frames_of_another_exposure_are_taken_again_and_never_stored() -> None:
     whole = camera(Fake()).expose()
-    wrong = Frame(np.full((6, 10), 1, np.uint16), 0.15, 0.005)
+    wrong = CameraFrame(np.full((6, 10), 1, np.uint16), 0.15, 0.005)
     fake = Fake({1: FrameLost("2 packets"), 3: wrong, 4: FrameLost("late")})
     damaged = camera(fake)
     record = damaged.expose()
@@ -153,13 +153,13 @@ def test_a_camera_that_keeps_losing_frames_is_given_up_with_the_reason() -> None
 @pytest.mark.parametrize(
     ("frame", "says"),
     [
-        (Frame(np.zeros((6, 10), np.uint16), 0.05), "its clock went back"),
-        (Frame(np.zeros((6, 11), np.uint16), 9.0), "Remedy: width, height"),
-        (Frame(np.zeros((6, 10), np.uint8), 9.0), "uint8"),
-        (Frame(np.full((6, 10), 4096, np.uint16), 9.0), "above the 4095 of 12 bits"),
+        (CameraFrame(np.zeros((6, 10), np.uint16), 0.05), "its clock went back"),
+        (CameraFrame(np.zeros((6, 11), np.uint16), 9.0), "Remedy: width, height"),
+        (CameraFrame(np.zeros((6, 10), np.uint8), 9.0), "uint8"),
+        (CameraFrame(np.full((6, 10), 4096, np.uint16), 9.0), "above the 4095 of 12 bits"),
     ],
 )
-def test_frames_that_cannot_be_are_refused(frame: Frame, says: str) -> None:
+def test_frames_that_cannot_be_are_refused(frame: CameraFrame, says: str) -> None:
     with pytest.raises(CameraError, match=says):
         camera(Fake({2: frame})).expose()
 

@@ -66,7 +66,7 @@ def test_a_laser_that_says_yes_and_stays_on_is_not_called_off(monkeypatch: pytes
     bench = LaserBench(head=LaserHead(532.0, 100.0, stored_level=0xFFF))
     assert bench.head.switch_on(bench.now())
     bench.clock.sleep(10.0)
-    with pytest.raises(DeviceFault, match=r"was told to go off, says that it is o.* measures 100.00 mW \(allowed: 1\)"):
+    with pytest.raises(DeviceFault, match=r"to go off, reports that it is o.* measures 100.00 mW \(allowed: 1\)"):
         bench.connect()
 
 

@@ -141,7 +141,7 @@ def test_a_laser_that_says_off_and_emits_is_not_let_out(
         run = probe(file, None) if command == "probe" else selftest(file, None, armed=True)
         findings = {f.name: f for f in run}
     first = findings["laser 635 nm" if command == "probe" else "laser 635 nm, off"]
-    assert not first.good and "was told to go off, says that it is on" in first.text
+    assert not first.good and "was told to go off, reports that it is on" in first.text
     assert sum(not f.good for f in findings.values()) == (1 if command == "probe" else 2)
     assert command == "probe" or not findings["gates"].good
     assert not any(pattern & 0b111 for pattern in lines)
