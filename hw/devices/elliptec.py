@@ -1,21 +1,19 @@
 """Thorlabs Elliptec rotation stages (ELL14): 9600 baud, one hex digit of address and two letters a command.
 
 The answer to a move comes when the motion has ended; `GS` with a code comes instead of it when something is wrong.
-Answers have no number of ours and no checksum, so that after a lost one the stage is asked who it is: what comes before
-that answer is old.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import TypeVar
 
 import numpy as np
 
 from hw.base.errors import DeviceFault, NoAnswer
 from hw.devices.turning import BLOCKED, POLL_S, degrees_of, not_reached
-from hw.serial.link import Inbox, LineFramer, Link, asked
+from hw.serial.dialogue import Dialogue
+from hw.serial.link import Link
 
 T = TypeVar("T")
 
@@ -24,7 +22,6 @@ ANSWER_S = 0.5
 HOME_S = 20.0
 PATIENCE_S = 5.0  # most moves have ended by then
 QUIET_S = 0.3
-RESYNC_S = 3.0
 ROTARY = {0x0E: "ELL14", 0x12: "ELL18"}
 OK, BUSY = 0, 9
 CODES = {
@@ -50,35 +47,21 @@ class ElliptecTable:
     def __init__(self, link: Link, address: int = 0, reach_s: float = 20.0) -> None:
         self.link, self.reach_s = link, reach_s
         self._address = f"{address:X}"
-        self._owed = False  # an answer that was not waited for may still come
-        self._inbox: Inbox[str] = Inbox(link, LineFramer())
+        self._dialogue = Dialogue(link, "", (f"{self._address}in", lambda m: m[:3] == self._address + "IN"), QUIET_S)
         self.model, self.serial_number, self._pulses = self._identify()
 
     # ---- talking
 
-    def _once(self, command: str, expected: str, timeout_s: float) -> str:
-        """The data of the next `expected` answer or of a `GS`, which begins with its letters."""
-        a = self._address
-        if self._owed:
-            self._resynchronise()
-        self._inbox.clear()
-        self.link.write((a + command).encode("ascii"))
-        wanted = {a + expected, a + "GS"}
-        line = self._inbox.next(lambda m: m[:3] in wanted, timeout_s)
-        self._owed = line is None
-        if line is None:
-            raise self.link.no_answer(repr(a + command), timeout_s)
-        return line[1:]
+    def _answers(self, expected: str) -> Callable[[str], bool]:
+        """Whether a line is the `expected` answer, or a `GS`."""
+        wanted = {self._address + expected, self._address + "GS"}
+        return lambda line: line[:3] in wanted
 
-    def _ask(self, command: str, expected: str, parse: Callable[[str], T], timeout_s: float = ANSWER_S) -> T:
-        once = partial(self._once, command, expected, timeout_s)
-        return asked(self.link, repr(self._address + command), once, parse, self._resynchronise)
-
-    def _resynchronise(self) -> None:
-        """Answers come in order: once the stage has said who it is, no older answer can come any more."""
-        self._inbox.drain(QUIET_S)
-        self.link.write((self._address + "in").encode("ascii"))
-        self._owed = self._inbox.next(lambda m: m[:3] == self._address + "IN", RESYNC_S) is None
+    def _ask(self, command: str, expected: str, parse: Callable[[str], T]) -> T:
+        """The answer from its letters on."""
+        return self._dialogue.ask(
+            self._address + command, self._answers(expected), ANSWER_S, lambda line: parse(line[1:])
+        )
 
     # ---- identity
 
@@ -126,7 +109,8 @@ class ElliptecTable:
         """Start, and wait for the answer at the end of the motion; if it does not come, ask."""
         clock = self.link.clock
         try:
-            self._check(self._once(command, "PO", min(limit_s, PATIENCE_S)))
+            limit = min(limit_s, PATIENCE_S)
+            self._check(self._dialogue.once(self._address + command, self._answers("PO"), limit)[1:])
         except NoAnswer:
             while (code := self._ask("gs", "GS", _code)) == BUSY:
                 if clock.now() > end:

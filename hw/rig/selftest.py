@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -16,11 +16,15 @@ from hw.base.clock import Clock
 from hw.base.errors import DeviceFault, DiscoError, InputError
 from hw.devices.omicron import OmicronLaser
 from hw.devices.ophir import OphirMeter
+from hw.devices.turning import TurntableDriver
 from hw.rig.connect import Connector, open_camera, require_black
-from hw.rig.drivers import Board, Closable, darken
+from hw.rig.drivers import Board, Closable, close_all, darken
 from hw.rig.emission import begin_emission, require_darkness, require_light
 from hw.rig.rig_file import EMULATED, GenicamDevice, LaserDevice, RigFile
 from hw.rig.verified_board import VerifiedBoard
+
+if TYPE_CHECKING:
+    from hw.camera.genicam import GenicamCamera
 
 log = logging.getLogger(__name__)
 
@@ -100,12 +104,23 @@ def _light(clock: Clock, board: Board, laser: OmicronLaser) -> Iterator[Callable
             raise
 
 
-def _cameras(file: RigFile, shapes: Shapes | None) -> list[tuple[GenicamDevice, tuple[int, int]]]:
-    """The GenICam cameras and their (height, width)."""
+def _try_on(name: str, opened: Callable[[], C], check: Callable[[C], str]) -> DeviceFinding:
+    """Try a device that is opened for that."""
+
+    def tried() -> str:
+        with _using(opened()) as device:
+            return check(device)
+
+    return _try(name, tried)
+
+
+def _cameras(file: RigFile, shapes: Shapes | None) -> list[tuple[str, Callable[[], GenicamCamera]]]:
+    """The GenICam cameras: name, and how each is opened."""
     cameras = [camera for camera in file.cameras if isinstance(camera, GenicamDevice)]
     if cameras and shapes is None:
         raise InputError("GenICam cameras need the scene, which has their size", remedy="add --scene SCENE")
-    return [(camera, (shapes or {})[camera.name]) for camera in cameras]
+    return [(f"camera {device.name}", partial(open_camera, file, device, (shapes or {})[device.name]))
+            for device in cameras]  # fmt: skip
 
 
 def probe(file: RigFile, shapes: Shapes | None, logs: Path | None = None) -> Generator[DeviceFinding, None, None]:
@@ -114,37 +129,24 @@ def probe(file: RigFile, shapes: Shapes | None, logs: Path | None = None) -> Gen
     shapes: (height, width) of every camera by its name; needed for GenICam cameras alone
     """
     connect = Connector(file, logs=logs)
-
-    def identified(index: int) -> str:
-        with _using(connect.omicron(index)) as laser:
-            found, mw = laser.identity, laser.require_off()
-        kind = f"{found.model} {found.wavelength_nm:g} nm, {found.max_power_mw:g} mW"
-        return f"{kind}, no. {found.serial_number}; off ({mw:.2f} mW)"
-
-    def board() -> str:
-        with _using(connect.board()):
-            return "MM-Ard; every line low"
-
-    def table() -> str:
-        with _using(connect.table()) as driver:
-            return f"{file.turntable.kind}, at {np.rad2deg(driver.angle_rad()):.2f} deg"
-
     for index, device in enumerate(file.lasers):
         if device.port != EMULATED:
-            yield _try(device.title, partial(identified, index))
+            yield _try_on(device.title, partial(connect.omicron, index), _laser_identity)
     if file.board.port != EMULATED:
-        yield _try("mirror board", board)
+        yield _try_on("mirror board", connect.board, lambda board: "MM-Ard; every line low")
     if file.turntable.port != EMULATED:
-        yield _try("turntable", table)
+        kind = file.turntable.kind
+        yield _try_on("turntable", connect.table, lambda table: f"{kind}, at {np.rad2deg(table.angle_rad()):.2f} deg")
     if file.power_meter is not None and file.power_meter.port != EMULATED:
-        yield _try("power meter", partial(_meter_reads, connect))
-    for device_, shape in _cameras(file, shapes):
-        yield _try(f"camera {device_.name}", partial(_camera_identity, file, device_, shape))
+        yield _try_on("power meter", connect.meter, lambda meter: f"reads {1e3 * meter.read():.3f} mW")
+    for name, opened in _cameras(file, shapes):
+        yield _try_on(name, opened, lambda camera: camera.grabber.identity())
 
 
-def _meter_reads(connect: Connector) -> str:
-    with _using(connect.meter()) as meter:
-        return f"reads {1e3 * meter.read():.3f} mW"
+def _laser_identity(laser: OmicronLaser) -> str:
+    found, mw = laser.identity, laser.require_off()
+    kind = f"{found.model} {found.wavelength_nm:g} nm, {found.max_power_mw:g} mW"
+    return f"{kind}, no. {found.serial_number}; off ({mw:.2f} mW)"
 
 
 @contextmanager
@@ -158,19 +160,13 @@ def _metering(connect: Connector) -> Iterator[OphirMeter | None]:
             yield meter
 
 
-def _camera_identity(file: RigFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
-    assert file.sensor is not None
-    with _using(open_camera(file, device, shape)) as camera:
-        return camera.grabber.identity()
-
-
 def selftest(
     file: RigFile, shapes: Shapes | None, armed: bool, logs: Path | None = None
 ) -> Generator[DeviceFinding, None, None]:
     """Exercise every real device. Lasers emit, one behind an open gate at a time, only if `armed`."""
     connect = Connector(file, logs=logs)
     lasers = {laser.title: i for i, laser in enumerate(file.lasers) if laser.port != EMULATED}
-    off = [_try(f"{name}, off", partial(_test_off, connect, index)) for name, index in lasers.items()]
+    off = [_try_on(f"{name}, off", partial(connect.omicron, i), _test_off) for name, i in lasers.items()]
     yield from off
     board = None
     if file.board.port != EMULATED:
@@ -184,17 +180,14 @@ def selftest(
             yield DeviceFinding("gates", False, "left shut, and nothing moved: a laser did not say that it is off")
             return
         if file.turntable.port != EMULATED:
-            yield _try("turntable", lambda: _test_table(connect))
-        for device, shape in _cameras(file, shapes):
-            yield _try(f"camera {device.name}", partial(_test_camera, file, device, shape))
+            yield _try_on("turntable", connect.table, _test_table)
+        for name, opened in _cameras(file, shapes):
+            yield _try_on(name, opened, partial(_test_camera, file))
         if board is not None:
             yield from _test_light(connect, board, lasers if armed else {})
     finally:
         if board is not None:
-            try:
-                board.close()
-            except DiscoError as error:
-                log.warning("%s", error)
+            close_all(connect.clock, [board])
 
 
 def _test_light(connect: Connector, board: Board, lasers: Mapping[str, int]) -> Iterator[DeviceFinding]:
@@ -207,27 +200,23 @@ def _test_light(connect: Connector, board: Board, lasers: Mapping[str, int]) -> 
         yield _try(name, partial(_test_laser, connect, board, index))
 
 
-def _test_table(connect: Connector) -> str:
-    with _using(connect.table()) as table:
-        table.home()
-        for angle in (TEST_ANGLE_DEG, 0.0):
-            table.move(float(np.deg2rad(angle)))
-            off = (np.rad2deg(table.angle_rad()) - angle + 180.0) % 360.0 - 180.0
-            if abs(off) > ANGLE_TOLERANCE_DEG:
-                problem = (
-                    f"says that it stands {off:+.3f} deg from {angle:g} deg (allowed: {ANGLE_TOLERANCE_DEG:g} off)"
-                )
-                raise DeviceFault(table.link.url, "turntable", problem, "check microsteps_per_deg in the rig file")
-        return f"homed, turned to {TEST_ANGLE_DEG:g} deg and back"
+def _test_table(table: TurntableDriver) -> str:
+    table.home()
+    for angle in (TEST_ANGLE_DEG, 0.0):
+        table.move(float(np.deg2rad(angle)))
+        off = (np.rad2deg(table.angle_rad()) - angle + 180.0) % 360.0 - 180.0
+        if abs(off) > ANGLE_TOLERANCE_DEG:
+            problem = f"reports to be {off:+.3f} deg from {angle:g} deg (allowed: {ANGLE_TOLERANCE_DEG:g} off)"
+            raise table.link.error(DeviceFault, problem, "check microsteps_per_deg in the rig file")
+    return f"homed, turned to {TEST_ANGLE_DEG:g} deg and back"
 
 
-def _test_camera(file: RigFile, device: GenicamDevice, shape: tuple[int, int]) -> str:
-    assert file.sensor is not None
-    with _using(open_camera(file, device, shape)) as camera:
-        black = require_black(camera, file.sensor)
-        for _ in range(FRAMES):
-            camera.expose()
-        return f"{FRAMES} brackets, {camera.lost} frames taken again, black level {black:.1f} DN"
+def _test_camera(file: RigFile, camera: GenicamCamera) -> str:
+    assert file.sensor is not None  # the rig file's own check
+    black = require_black(camera, file.sensor)
+    for _ in range(FRAMES):
+        camera.expose()
+    return f"{FRAMES} brackets, {camera.lost} frames taken again, black level {black:.1f} DN"
 
 
 def _test_mirrors(file: RigFile, board: Board) -> str:
@@ -255,9 +244,8 @@ def _test_dark(file: RigFile, board: Board) -> str:
     return f"{', '.join(map(str, read))} counts"
 
 
-def _test_off(connect: Connector, index: int) -> str:
-    with _using(connect.omicron(index)) as laser:
-        return f"{laser.require_off():.2f} mW while off"
+def _test_off(laser: OmicronLaser) -> str:
+    return f"{laser.require_off():.2f} mW while off"
 
 
 def _test_laser(connect: Connector, board: Board, index: int) -> str:

@@ -72,5 +72,5 @@ def test_errors_end_in_one_line() -> None:
     with pytest.raises(DeviceRefused, match=r"refused \$SP \(NO HEAD\)"):
         meter.read()
     bench.line.answer_faults.extend([lost] * 9)
-    with pytest.raises(NoAnswer, match=r"did not answer \$SP within 1 s"):
+    with pytest.raises(NoAnswer, match=r"did not answer '\$SP' within 1 s"):
         meter.read()
