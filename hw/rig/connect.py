@@ -1,7 +1,7 @@
 """From a rig file to drivers: every device on its port, or on the port of what stands in for it, and the cameras.
 
 Emulated ports, simulated cameras and the sizes of real ones are handed in. A script that needs no light, and so no
-`hw.rig.serial_rig.SerialRig`, uses a `Connector` alone (docs/lab.md, section 8).
+`hw.rig.serial_rig.SerialRig`, uses a `Connector` alone (docs/lab.md, section 7).
 """
 
 from __future__ import annotations

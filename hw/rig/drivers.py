@@ -35,6 +35,9 @@ class LaserDriver(Protocol):
     def require_power(self, tolerance: float) -> float:
         """The laser's own reading in mW, refused where it is not its set point within this share."""
 
+    def require_off(self) -> float:
+        """The laser's own reading in mW, refused where it is not dark."""
+
     def darken(self) -> None:
         """Send the command for darkness without waiting for the answer."""
 

@@ -301,6 +301,8 @@ def open_rig(
         for device in file.cameras:
             if isinstance(device, GenicamDevice):
                 assert file.sensor is not None  # the rig file's own check
+                if device.name not in shapes:
+                    raise InputError(f"camera {device.name} needs its size", remedy="hand in (height, width)")
                 camera = open_camera(file, device, shapes[device.name])
                 opened.callback(camera.close)
                 black.append(partial(require_black, camera, file.sensor))
