@@ -50,13 +50,14 @@ def run(
     faults: FaultsOption = None,
 ) -> None:
     """Capture, reconstruct, relight and score; writes summary.json and report.html. The same command resumes."""
-    from disco_twin.run.stages import begin_run, print_scores, run_all
+    from disco_twin.cli.tables import score_table
+    from disco_twin.run.stages import begin_run, run_all
 
     with naming(scene):
         opened = begin_run(scene, out, profile, methods, console, faults)
         console.print(f"[bold]{opened.scene.name}[/bold] into {out}", highlight=False)
         summary = run_all(opened)
-    print_scores(summary, opened.methods, console)
+    console.print("", score_table(summary, opened.methods), sep="\n")
     console.print(f"\nreport: {opened.folder.report_file.resolve()}", soft_wrap=True, highlight=False)
 
 
@@ -108,7 +109,7 @@ def quality(
     capture_folder: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture: DIR/capture of a run.")],
 ) -> None:
     """Show the quality of a capture view by view, finished or not. Needs no renderer."""
-    from disco_twin.run.progress import quality_table
+    from disco_twin.cli.tables import quality_table
     from hw.base.config import read_json
     from pipeline.capture.quality import examine
     from pipeline.records import SensorFile
@@ -137,10 +138,10 @@ def reconstruct(out: RunOut, methods: MethodsOption = None) -> None:
 @app.command()
 def reference(scene: SceneFile, out: RunOut, profile: ProfileOption = "full") -> None:
     """Render the reference images of a scene into DIR, one EXR per light and held-out view."""
+    from disco_twin.experiment.capturable import require_capturable
     from disco_twin.experiment.experiment import Experiment
     from disco_twin.experiment.references import render_references, shipped_references
     from disco_twin.run.progress import stage_bar
-    from disco_twin.run.simulate import require_capturable
     from disco_twin.scene.scene import load_scene
 
     loaded = load_scene(scene, profile)
@@ -154,25 +155,27 @@ def reference(scene: SceneFile, out: RunOut, profile: ProfileOption = "full") ->
 @app.command()
 def score(out: RunOut, methods: MethodsOption = None, budget: BudgetOption = False) -> None:
     """Score a finished run again and write its summary and report. Needs no renderer."""
+    from disco_twin.cli.tables import budget_table, score_table
     from disco_twin.run.progress import run_log
-    from disco_twin.run.stages import print_budget, print_scores, reopen_run, score_stages
+    from disco_twin.run.stages import reopen_run, score_stages
 
     opened = reopen_run(out, methods, console)
     with naming(opened.scene_file), run_log(opened.folder.root / "run.log", console):
-        print_scores(score_stages(opened), opened.methods, console)
+        console.print("", score_table(score_stages(opened), opened.methods), sep="\n")
         if budget:
             from disco_twin.evaluate.budget import score_budget
 
-            print_budget(score_budget(opened.experiment, opened.folder, opened.methods[0]), console)
+            rows = score_budget(opened.experiment, opened.folder, opened.methods[0])
+            console.print("", budget_table(rows), sep="\n")
 
 
 @app.command()
 def plan(scene: SceneFile, profile: ProfileOption = "full") -> None:
     """Predict images, bytes and time of a scene, and say what it leaves out. Needs no renderer."""
+    from disco_twin.experiment.capturable import require_capturable
     from disco_twin.experiment.experiment import Experiment
     from disco_twin.experiment.references import shipped_references
     from disco_twin.run.cost_prediction import predict
-    from disco_twin.run.simulate import require_capturable
     from disco_twin.scene.scene import load_scene
 
     with naming(scene):

@@ -1,5 +1,1 @@
-"""A scene with all that is built from it, its run folder, and the pipeline as a process of its own."""
-
-from disco_twin.experiment.experiment import Experiment
-
-__all__ = ["Experiment"]
+"""A scene with all that is built from it, the keys of it, its run folder, and the pipeline as a process of its own."""

@@ -8,9 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from disco_twin.experiment.experiment import Experiment, plain
-from disco_twin.experiment.run_folder import content_key
-from disco_twin.scene.scene import Scene
+from disco_twin.experiment.experiment import Experiment
+from disco_twin.experiment.keys import content_key, plain
 from hw.base.errors import InputError
 from hw.base.files import write_atomically
 from pipeline.geometry.camera import PinholeCamera
@@ -18,6 +17,7 @@ from pipeline.geometry.nominal_rig import CameraConfig
 from pipeline.relight.lights import Light
 
 if TYPE_CHECKING:
+    from disco_twin.scene.scene import Scene
     from pipeline.capture.loop import Progress
 
 log = logging.getLogger(__name__)

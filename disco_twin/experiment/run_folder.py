@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from hw.base.config import Strict, as_table, read_json
 from hw.base.errors import DiscoError, InputError
@@ -239,30 +239,3 @@ def _barely_begun(root: Path) -> bool:
     """Whether a folder without a journal is one that a run could not finish making (a full disk, a kill), or empty."""
     files = {"scene.toml", "scene.toml.part", "stages.json.part"}
     return all(path.name in files or (path.name in FOLDERS and not any(path.iterdir())) for path in root.iterdir())
-
-
-def content_key(*parts: Any) -> str:
-    """SHA-256 over the parts: text, bytes, files (their content), or anything that JSON can hold."""
-    digest = hashlib.sha256()
-    for part in parts:
-        if isinstance(part, Path):
-            data = part.read_bytes()
-        elif isinstance(part, bytes):
-            data = part
-        else:
-            data = (part if isinstance(part, str) else json.dumps(part, sort_keys=True)).encode()
-        digest.update(len(data).to_bytes(8, "little"))
-        digest.update(data)
-    return digest.hexdigest()
-
-
-def source_key(package: str) -> str:
-    """Key of a package's source code: a method developer's change makes its stage run again."""
-    from importlib.util import find_spec
-
-    spec = find_spec(package)
-    if spec is None or spec.origin is None:
-        raise InputError(f"the package {package} is not installed", remedy="make install")
-    origin = Path(spec.origin)
-    files = sorted(origin.parent.rglob("*.py")) if origin.name == "__init__.py" else [origin]
-    return content_key(*files)

@@ -54,18 +54,26 @@ class SpotResponses:
     """Implements `disco_twin.emulation.twin_rig.ResponseSource` by the photon walk.
 
     Each chunk of spots is one file `spots-<name>.npy` in `scratch`, (2, spots, C, L, H, W) float32: mean radiance per
-    watt, and the simulation's own variance of it.
+    watt, and the simulation's own variance of it. `code` is the key of the code that simulates: what other code left
+    is not read.
     """
 
     def __init__(
-        self, transport: Transport, config: RigConfig, actual: ActualRig, walks: int, seed: int, scratch: Path
+        self,
+        transport: Transport,
+        config: RigConfig,
+        actual: ActualRig,
+        walks: int,
+        seed: int,
+        scratch: Path,
+        code: str = "",
     ) -> None:
         self.transport, self.config, self.actual = transport, config, actual
         self.walks, self.seed, self.scratch = walks, seed, scratch
         self.views = [
             [actual.camera(c, j) for c in range(len(config.cameras))] for j in range(len(config.turntable_angles_deg))
         ]
-        self._key = light_key(transport.object, config, actual)
+        self._key = (light_key(transport.object, config, actual), walks, seed, code)
         self._chunk_of: dict[Aim, tuple[Aim, ...]] = {}
         self._loaded: tuple[tuple[Aim, ...], F32] | None = None
         scratch.mkdir(parents=True, exist_ok=True)
@@ -95,7 +103,7 @@ class SpotResponses:
         return np.asarray(self._loaded[1][:, chunk.index(aim)])
 
     def _load(self, chunk: tuple[Aim, ...]) -> F32:
-        name = hashlib.sha256(repr((self._key, chunk, self.walks, self.seed)).encode()).hexdigest()[:16]
+        name = hashlib.sha256(repr((self._key, chunk)).encode()).hexdigest()[:16]
         path = self.scratch / f"spots-{name}.npy"
         if not path.exists():
             simulated = self._simulate(chunk)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import trimesh
 
@@ -11,10 +11,12 @@ from disco_twin.object import shapes
 from disco_twin.object.media import Medium, build_medium
 from disco_twin.object.mesh import check_size, hat_basis, read_mesh, remesh
 from disco_twin.object.scanner import scan_points
-from disco_twin.scene.object_schema import Box, MeshFile, ObjectConfig, Pebble, Sphere, Torus
-from disco_twin.scene.scene import MOST_VERTICES, Scene
+from disco_twin.scene.object_schema import MOST_VERTICES, Box, MeshFile, ObjectConfig, Pebble, Sphere, Torus
 from hw.base.errors import InputError
 from pipeline.geometry.surface_from_points import reconstruct_surface
+
+if TYPE_CHECKING:
+    from disco_twin.scene.scene import Scene
 
 __all__ = ["Boundary", "Medium", "TwinObject", "build_object", "build_scan", "hat_basis"]
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from disco_twin.evaluate.simulation_noise import walks_below_camera
-from disco_twin.experiment.experiment import Experiment, left_out_by_the_twin
+from disco_twin.experiment.experiment import Experiment
+from disco_twin.experiment.omissions import left_out_by_the_twin
 from disco_twin.experiment.references import holds_reference
 from hw.base.resources import usable_cores
 from pipeline.plan.targets import make_targets

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 from disco_twin.emulation.emulated_rig import open_scene_rig
 from disco_twin.emulation.served_rig import Darkness
 from disco_twin.emulation.twin_rig import TwinRig
-from disco_twin.experiment.run_folder import content_key
+from disco_twin.experiment.keys import content_key
 from disco_twin.run import simulate
+from disco_twin.run.scan import sensor_of, write_scan
 from hw.base.errors import InputError, naming
 from hw.base.files import require_folder, write_atomically
 from hw.rig.rig_file import EMULATED, RigFile
@@ -74,10 +75,10 @@ def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool
     if not _has_images(folder.capture):  # what the images are begun with is kept
         write_atomically(folder.devices_record, path.read_bytes())
     real = None if file.sensor is None or file.simulated_cameras else file.sensor.sensor()
-    sensor = simulate.sensor_of(experiment, real)
+    sensor = sensor_of(experiment, real)
     key = content_key(folder.identity, "devices")
     scan_key = content_key(key, repr(sensor))  # the sensor may be corrected before the first image
-    run.stage("scan", scan_key, lambda _: simulate.write_scan(experiment, folder.capture, real))
+    run.stage("scan", scan_key, lambda _: write_scan(experiment, folder.capture, real))
 
     def take_images(report: Report) -> None:
         with naming(path), open_scene_rig(file, run.scene.rig, _twin(run, file), logs, armed=armed) as rig:
@@ -89,7 +90,7 @@ def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool
 def _twin(run: Run, file: RigFile) -> TwinRig | None:
     """What simulated cameras look at; emulated devices without one need no light."""
     if file.simulated_cameras:
-        return simulate.twin_rig(run.experiment, run.folder)
+        return simulate.twin_rig(run.experiment, run.folder.twin / "responses")
     if EMULATED in file.ports().values():
         return TwinRig(run.scene.rig, Darkness(), run.scene.seed)
     return None

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import (
@@ -21,11 +19,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
 from rich.text import Text
-
-if TYPE_CHECKING:
-    from pipeline.capture.quality import ViewQuality
 
 Report = Callable[[int, int], None]  # done, total
 
@@ -116,23 +110,3 @@ class _LogFile(logging.FileHandler):
         if not self.refused:
             self.console.print(f"  warning: {self.baseFilename} takes no more messages", style="yellow", markup=False)
         self.refused = True
-
-
-def quality_table(views: Sequence[ViewQuality]) -> Table:
-    """A row for every view."""
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for name in ("view", "camera", "deg", "images", "saturated", "lit", "range", "dark", "mW"):
-        table.add_column(name, justify="left" if name == "camera" else "right", no_wrap=True)
-    for v in views:
-        table.add_row(
-            str(v.view),
-            v.camera,
-            f"{math.degrees(v.angle_rad):.1f}",
-            f"{v.stored}/{v.planned}",
-            f"{100 * v.saturated:.2f} %",
-            f"{100 * v.significant:.1f} %",
-            f"{v.range_db:.0f} dB" if v.stored else "-",
-            f"{v.dark}/{v.spots}",
-            " ".join("-" if math.isnan(p) else f"{1e3 * p:.2f}" for p in v.power_w),
-        )
-    return table

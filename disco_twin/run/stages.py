@@ -10,9 +10,12 @@ from typing import Any
 
 from rich.console import Console
 
-from disco_twin.experiment.experiment import Experiment, identity, left_out_by_the_twin
+from disco_twin.experiment.experiment import Experiment
+from disco_twin.experiment.keys import code_key, content_key, identity
+from disco_twin.experiment.omissions import left_out_by_the_twin
 from disco_twin.experiment.pipeline_process import load_results, pipeline_inputs, reconstruct_apart, stale
-from disco_twin.experiment.run_folder import RunFolder, content_key, source_key
+from disco_twin.experiment.references import reference_key, render_references, shipped_references
+from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.run.progress import Report, run_log, stage_bar
 from disco_twin.scene.scene import Profile, Scene, load_scene
 from hw.base.config import read_json
@@ -21,38 +24,39 @@ from hw.base.files import write_atomically
 from pipeline.capture.loop import Interrupted
 from pipeline.reconstruct.registry import known_methods, require_method
 from pipeline.records import StageFigures
-from pipeline.stream.files import IMAGES, JOURNAL, PLAN
 from pipeline.stream.stream import StreamReader
 
 log = logging.getLogger(__name__)
 
+SCENE_RECORD = "scene.json"  # the scene as it was run: profile applied, file names absolute
+CODE = {  # where the code of a stage begins: all that it imports is part of the stage's key
+    "scan": ("disco_twin.run.scan",),
+    "targets": ("disco_twin.run.targets",),
+    "spots": ("disco_twin.light.response",),
+    "capture": ("disco_twin.run.simulate",),
+    "truth": ("disco_twin.experiment.ground_truth",),
+    "references": ("disco_twin.experiment.references",),
+    "pipeline": ("pipeline.__main__", "pipeline.reconstruct"),  # methods are found in their files, not imported
+    "scores": ("disco_twin.evaluate.scores",),
+}
+CAPTURE = ("capture/images.bin", "capture/journal.bin", "capture/plan.json")
+TARGETS = ("capture/calibration/*/*", "capture/calibration/*/bracket/*")
+REFERENCES = ("twin/references/*.exr",)
 OUTPUTS = {  # files that a finished stage leaves, as patterns in the run folder
     "scan": ("capture/scan.ply", "capture/rig.json", "capture/sensor.json"),
-    "targets": ("capture/calibration/*/*", "capture/calibration/*/bracket/*"),
-    "capture": ("capture/images.bin", "capture/journal.bin", "capture/plan.json"),
+    "targets": TARGETS,
+    "capture": CAPTURE,
     "truth": ("twin/truth.npz",),
-    "references": ("twin/references/*.exr",),
+    "references": REFERENCES,
     "pipeline": ("work/pipeline.json", "work/model-*.npz", "work/request.json", "work/relit/*/*.npy"),
     "scores": ("twin/scores.json",),
 }
-LIGHT_CODE = (  # what the simulated light and the images of it come from
-    *(
-        f"disco_twin.{part}"
-        for part in (
-            "object",
-            "light",
-            "camera",
-            "faults",
-            "emulation.twin_rig",
-            "experiment",
-            "scene.materials",
-            "run.simulate",
-        )
-    ),
-    *(f"pipeline.{part}" for part in ("plan.spots", "plan.plan", "geometry.camera", "geometry.projector")),
-    "hw.record",
-)
-SCENE_RECORD = "scene.json"  # the scene as it was run: profile applied, file names absolute
+CONTINUED = {  # files that interrupted work is continued from
+    "targets": TARGETS,
+    "spots": ("twin/responses/spots-*.npy",),
+    "capture": (*CAPTURE, "twin/light.key"),  # the last one: of earlier versions
+    "references": REFERENCES,
+}
 
 
 @dataclass(frozen=True)
@@ -69,8 +73,15 @@ class Run:
     def scene(self) -> Scene:
         return self.experiment.scene
 
+    def key(self, stage: str, *inputs: Any) -> str:
+        """Key of a stage: what the scene says of the rig and the object, the stage's code, its other inputs."""
+        return content_key(self.folder.identity, code_key(*CODE[stage]), *inputs)
+
     def stage(self, name: str, key: str, work: Callable[[Report], Any], unit: str = "") -> None:
-        """Do one stage with its progress bar and say what it took; `work` may return its own peak memory in MiB."""
+        """Do one stage with its progress bar and print what it took; `work` may return its own peak memory in MiB.
+
+        Raises: Interrupted at Ctrl-C, DiscoError where the disk refuses, and what `work` raises.
+        """
 
         def watched() -> float | None:
             with stage_bar(self.console, name, unit) as report:
@@ -91,7 +102,7 @@ class Run:
 def begin_run(
     scene_file: Path, out: Path, profile: Profile, methods: str | None, console: Console, faults: bool | None = None
 ) -> Run:
-    """Read the scene and claim the folder for it."""
+    """Read the scene and claim the folder for it. Raises: InputError for either."""
     scene = load_scene(scene_file, profile, faults)
     chosen = choose_methods(methods, scene)
     folder = RunFolder.claim(out, scene_file, identity(scene))
@@ -100,14 +111,17 @@ def begin_run(
 
 
 def reopen_run(out: Path, methods: str | None, console: Console) -> Run:
-    """An existing run folder, to do a part of it again."""
+    """An existing run folder, to do a part of it again. Raises: InputError where it is none."""
     folder = RunFolder.open(out)
     scene = read_json(out / SCENE_RECORD, Scene, f"disco-twin run SCENE --out {out} writes it anew")
     return Run(Experiment(scene), folder, folder.scene_file, choose_methods(methods, scene), console)
 
 
 def choose_methods(text: str | None, scene: Scene) -> tuple[str, ...]:
-    """`default,disco2004` or `all`, or else the scene's; the cheap baselines are always scored."""
+    """`default,disco2004` or `all`, or else the scene's; the cheap baselines are always scored.
+
+    Raises: InputError for an unknown method.
+    """
     if text is None:
         chosen = list(scene.reconstruct.methods)
     else:
@@ -118,114 +132,98 @@ def choose_methods(text: str | None, scene: Scene) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*(require_method(name) for name in chosen), *baselines]))
 
 
-def light_key(run: Run) -> str:
-    """Key of all simulated light: what the scene says, and the code that makes object, light and images of it."""
-    return content_key(run.folder.identity, *(source_key(name) for name in LIGHT_CODE))
+def drop_outdated(folder: RunFolder, stage: str, key: str) -> None:
+    """Remove what other code left of an interrupted stage: it would otherwise be continued with the new.
 
-
-def drop_old_light(folder: RunFolder, key: str) -> None:
-    """Remove light that other code simulated: a stream or a reference would otherwise be continued with the new.
-
-    Nothing is removed from a folder whose light is of this key, or that has none yet.
+    Nothing is removed where the stage has left nothing yet, or was begun under this key (OUT/twin/<stage>.key).
     """
-    marker = folder.twin / "light.key"
+    marker = folder.twin / f"{stage}.key"
     if marker.is_file() and marker.read_text() == key:
         return
     with folder.alone():
-        _drop(folder)
+        old = [path for pattern in CONTINUED[stage] for path in folder.root.glob(pattern) if path.is_file()]
+        if old:
+            log.warning("the simulation's code has changed: the %s in %s are made again", stage, folder.root)
+        for path in old:
+            path.unlink()
         write_atomically(marker, key.encode())
 
 
-def _drop(folder: RunFolder) -> None:
-    old = [] if folder.taken_by_devices else [folder.capture / name for name in (IMAGES, JOURNAL, PLAN)]
-    old += [] if folder.taken_by_devices else [*folder.capture.glob("calibration/**/*")]
-    old += [*folder.twin.glob("responses/spots-*.npy"), *folder.twin.glob("references/*.exr")]
-    old = [path for path in old if path.is_file()]
-    if old:
-        log.warning("the simulation's code has changed: the light in %s is simulated again", folder.root)
-    for path in old:
-        path.unlink()
-
-
 def capture_stages(run: Run) -> None:
-    """Scan and capture by the twin. What devices have captured is left as it is, once it is complete."""
-    from disco_twin.run import simulate
-
+    """Scan and capture by the twin. What devices have captured is left as it is. Raises: InputError if it is cut."""
     if run.folder.taken_by_devices:
         with StreamReader(run.folder.capture) as stream:
             stream.require_complete()
         return
-    key = light_key(run)
-    drop_old_light(run.folder, key)
-    scan_key = content_key(key, run.scene.relight.model_dump_json(include={"views"}))
-    run.stage("scan", scan_key, lambda _: simulate.write_scan(run.experiment, run.folder.capture))
-    rig = run.scene.rig
-    if rig.faults.deviation or rig.sensor.response == "curved":  # else there is nothing that images could tell
-        run.stage(
-            "targets",
-            content_key(key, source_key("pipeline.plan.targets")),
-            lambda report: simulate.take_targets(run.experiment, run.folder, report),
-            "images",
-        )
-    run.stage("capture", key, lambda report: simulate.take_images(run.experiment, run.folder, report), "images")
+    from disco_twin.run.scan import write_scan
+    from disco_twin.run.simulate import take_images
+    from disco_twin.run.targets import take_targets
+
+    experiment, folder, scene = run.experiment, run.folder, run.scene
+    for name in ("targets", "spots", "capture"):
+        drop_outdated(folder, name, run.key(name))
+    views = scene.relight.model_dump_json(include={"views"})
+    run.stage("scan", run.key("scan", views), lambda _: write_scan(experiment, folder.capture))
+    if scene.rig.faults.deviation or scene.rig.sensor.response == "curved":  # else images of targets show nothing new
+        run.stage("targets", run.key("targets"), lambda report: take_targets(scene, folder.capture, report), "images")
+    responses = folder.twin / "responses"
+    run.stage(
+        "capture",
+        run.key("capture"),
+        lambda report: take_images(experiment, folder.capture, responses, report),
+        "images",
+    )
 
 
 def truth_stages(run: Run) -> None:
     """Ground-truth R_d and the reference images."""
-    from disco_twin.experiment.references import reference_key, render_references, shipped_references
-    from disco_twin.run import simulate
+    from disco_twin.experiment.ground_truth import compute_truth
 
-    scene, folder, key = run.scene, run.folder, light_key(run)
-    drop_old_light(folder, key)
-    run.stage(
-        "truth",
-        key,
-        lambda report: simulate.compute_truth(run.experiment, folder.twin / "truth.npz", report),
-        "columns",
-    )
+    experiment, scene, folder = run.experiment, run.scene, run.folder
+    truth = folder.twin / "truth.npz"
+    run.stage("truth", run.key("truth"), lambda report: compute_truth(experiment, truth, report), "columns")
+    drop_outdated(folder, "references", run.key("references"))
     keys = [reference_key(scene, light, view) for light in scene.relight.lights for view in scene.relight.views]
     shipped = shipped_references(run.scene_file, scene.name)
     run.stage(
         "references",
-        content_key(key, keys, scene.simulation.reference_walks),
-        lambda report: render_references(run.experiment, shipped, folder.twin / "references", report),
+        run.key("references", keys, scene.simulation.reference_walks),
+        lambda report: render_references(experiment, shipped, folder.twin / "references", report),
         "lights",
     )
 
 
 def pipeline_stage(run: Run) -> None:
     """Reconstruct and relight, in a process of its own that is given the capture and nothing of the truth."""
-    code = light_key(run), source_key("pipeline"), source_key("hw")
-    key = content_key(run.folder.identity, pipeline_inputs(run.scene, run.methods), *code)
+    done = run.folder.stages
+    capture = [done[name].key for name in ("scan", "targets", "capture") if name in done]
+    key = run.key("pipeline", capture, pipeline_inputs(run.scene, run.methods))
     run.stage("pipeline", key, lambda _: reconstruct_apart(run.scene, run.folder, run.methods))
     for warning in load_results(run.folder).warnings:
         log.warning("%s", warning)
 
 
 def score_stages(run: Run) -> dict[str, Any]:
-    """Scores, summary.json and report.html; the summary."""
+    """Scores, summary.json and report.html; the summary.
+
+    Raises: InputError where a stage before is not finished, or the reconstruction is of other settings.
+    """
     from disco_twin.evaluate.scores import load_scores, score_run
     from disco_twin.evaluate.summary import make_summary, write_summary
     from disco_twin.report.collect import collect
     from disco_twin.report.page import write_report
 
     done = run.folder.stages
+    again = f"disco-twin run {run.scene_file} --out {run.folder.root}"
     for name in ("capture", "truth", "references", "pipeline"):
         if name not in done or not done[name].finished:
-            raise InputError(
-                f"the stage {name} is not finished",
-                file=run.folder.root,
-                remedy=f"disco-twin run {run.scene_file} --out {run.folder.root}",
-            )
+            raise InputError(f"the stage {name} is not finished", file=run.folder.root, remedy=again)
     if why := stale(run.scene, run.folder, run.methods):
         remedy = f"disco-twin reconstruct --out {run.folder.root} --methods {','.join(run.methods)}"
         raise InputError(why, file=run.folder.work, key="--methods", value=",".join(run.methods), remedy=remedy)
-    key = content_key(
-        *(done[name].key for name in ("truth", "references", "pipeline")),
-        list(run.methods),
-        source_key("disco_twin.evaluate.scores"),
-        source_key("pipeline.relight.scores"),
-    )
+    if done["truth"].key != run.key("truth"):
+        log.warning("the code of the ground truth has changed since it was computed; `%s` computes it again", again)
+    key = run.key("scores", *(done[name].key for name in ("truth", "references", "pipeline")), list(run.methods))
     run.stage("scores", key, lambda _: score_run(run.experiment, run.folder, run.methods))
     made = load_results(run.folder)
     left_out = [*left_out_by_the_twin(run.experiment), *made.left_out]
@@ -257,39 +255,3 @@ def run_all(run: Run) -> dict[str, Any]:
         truth_stages(run)
         pipeline_stage(run)
         return score_stages(run)
-
-
-def print_scores(summary: dict[str, Any], methods: Sequence[str], console: Console) -> None:
-    """A table of nrmse by light and method."""
-    from rich.table import Table
-
-    from disco_twin.evaluate.summary import figure_or_dash, pooled
-
-    relit = summary["relit"]
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    table.add_column("nrmse")
-    for method in methods:
-        table.add_column(method, justify="right")
-    for light in dict.fromkeys(r["light"] for r in relit):
-        table.add_row(light, *(figure_or_dash(pooled(relit, method, light)) for method in methods))
-    console.print()
-    console.print(table)
-
-
-def print_budget(rows: Sequence[dict[str, Any]], console: Console) -> None:
-    """A table of nrmse by light and calibration."""
-    from rich.table import Table
-
-    from disco_twin.evaluate.summary import figure_or_dash, rms
-
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    table.add_column("nrmse, calibration")
-    lights = list(dict.fromkeys(row["light"] for row in rows))
-    for light in lights:
-        table.add_column(light, justify="right")
-    for name in dict.fromkeys(row["calibration"] for row in rows):
-        own = [row for row in rows if row["calibration"] == name]
-        kept = {x: [r["nrmse"] for r in own if r["light"] == x and r["nrmse"] is not None] for x in lights}
-        table.add_row(name, *(figure_or_dash(rms(kept[x]) if kept[x] else None) for x in lights))
-    console.print()
-    console.print(table)

@@ -1,4 +1,7 @@
-"""The schema of `[object]` in a scene: shape, boundary, medium. Object frame, mm, wavelengths in the rig's order."""
+"""The schema of `[object]` and `[scan]` in a scene: shape, boundary, medium; the mesh that the pipeline is given.
+
+Object frame, mm, wavelengths in the rig's order.
+"""
 
 from __future__ import annotations
 
@@ -231,3 +234,19 @@ class ObjectConfig(Strict):
     shape: Shape
     boundary: BoundaryConfig = BoundaryConfig()
     medium: MediumConfig
+
+
+# ---------------------------------------------------------------- scan
+MOST_VERTICES = 20_000  # R_d holds vertices^2 entries a laser, with their variance: 3.2 GB each at this size
+
+
+def _storable(vertices: int) -> int:
+    if vertices > MOST_VERTICES:
+        raise ValueError(f"R_d holds the square of that for every laser, at most {MOST_VERTICES} vertices fit")
+    return vertices
+
+
+class ScanConfig(Strict):
+    """The mesh that the pipeline is given: about `vertices` vertices, or (left out) the object's own mesh."""
+
+    vertices: Annotated[int, Field(ge=50), AfterValidator(_storable)] | None = None

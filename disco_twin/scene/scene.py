@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from disco_twin.scene.object_schema import ObjectConfig
+from disco_twin.scene.object_schema import ObjectConfig, ScanConfig
 from disco_twin.scene.rig_schema import FaultsConfig, TwinRigConfig
 from hw.base.config import Strict, load_toml
 from pipeline.geometry.nominal_rig import CameraConfig
@@ -16,21 +16,6 @@ from pipeline.relight.lights import Colour, Light, shipped_lights
 
 Count = Annotated[int, Field(ge=1, lt=2**32)]  # photons are numbered in 32 bits
 Profile = Literal["full", "small"]
-
-
-MOST_VERTICES = 20_000  # R_d holds vertices^2 entries a laser, with their variance: 3.2 GB each at this size
-
-
-def _storable(vertices: int) -> int:
-    if vertices > MOST_VERTICES:
-        raise ValueError(f"R_d holds the square of that for every laser, at most {MOST_VERTICES} vertices fit")
-    return vertices
-
-
-class ScanConfig(Strict):
-    """The mesh that the pipeline is given: about `vertices` vertices, or (left out) the object's own mesh."""
-
-    vertices: Annotated[int, Field(ge=50), AfterValidator(_storable)] | None = None
 
 
 class SimulationConfig(Strict):

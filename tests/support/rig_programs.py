@@ -46,7 +46,7 @@ hw.devices.mm_ard.BOOT_S = 0.05
 import disco_twin.run.simulate
 from disco_twin.emulation.twin_rig import TwinRig
 from twin_fakes import Glow
-disco_twin.run.simulate.twin_rig = lambda world, folder: TwinRig(world.scene.rig, Glow(), 5)
+disco_twin.run.simulate.twin_rig = lambda experiment, _: TwinRig(experiment.scene.rig, Glow(), 5)
 sys.argv[0] = "disco-twin"
 from disco_twin.cli.start import main
 main()

@@ -101,7 +101,7 @@ def test_what_goes_wrong_later(
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("disco_twin.run.simulate.write_scan", fail)
+    monkeypatch.setattr("disco_twin.run.scan.write_scan", fail)
     quick = str(repository / "scenes" / "quick.toml")
     found, line = status_and_line(["run", quick, "--out", str(tmp_path / "out"), "--profile", "small"], capsys)
     assert found == status

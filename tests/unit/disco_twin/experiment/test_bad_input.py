@@ -16,6 +16,7 @@ from scene_fakes import sphere
 from scene_texts import GOOD
 
 from disco_twin.evaluate.scores import load_relit, load_scores
+from disco_twin.experiment.capturable import require_capturable
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.pipeline_process import load_results, pipeline_inputs, stale
 from disco_twin.experiment.references import render_references
@@ -25,7 +26,6 @@ from disco_twin.light.truth import Truth
 from disco_twin.object.mesh import read_mesh
 from disco_twin.object.voxels import read_voxels
 from disco_twin.run.progress import run_log
-from disco_twin.run.simulate import require_capturable
 from disco_twin.scene.scene import Scene, load_scene
 from hw.base.config import read_json
 from hw.base.errors import InputError, naming, refused_by_the_disk

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from disco_twin.experiment.run_folder import RunFolder, content_key
+from disco_twin.experiment.keys import content_key
+from disco_twin.experiment.run_folder import RunFolder
 from hw.base.errors import InputError
 from hw.base.files import write_atomically
 from hw.base.resources import measured, usable_cores

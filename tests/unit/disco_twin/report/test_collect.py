@@ -15,11 +15,11 @@ from report_fakes import METHODS, fake_data
 from rich.console import Console
 from scene_fakes import sphere
 
+from disco_twin.cli.tables import score_table
 from disco_twin.evaluate.scores import KEPT, usable_score
 from disco_twin.report.collect import SPOTS_SHOWN, impulses
 from disco_twin.report.page import render
-from disco_twin.run.simulate import write_scan
-from disco_twin.run.stages import print_scores
+from disco_twin.run.scan import write_scan
 from hw.base.errors import InputError
 from pipeline.geometry.nominal_rig import CameraConfig
 from pipeline.stream.stream import StreamReader
@@ -49,7 +49,7 @@ def test_the_report_and_the_table_show_a_dash_where_there_is_no_score() -> None:
     page = render(replace(data, summary={**data.summary, "relit": [r | dict.fromkeys(KEPT) for r in rows]}))
     assert "<b>-</b><span>nrmse under broad light" in page
     out = StringIO()
-    print_scores({"relit": rows}, list(METHODS), Console(file=out, width=200))
+    Console(file=out, width=200).print(score_table({"relit": rows}, list(METHODS)))
     lines = {line.split()[0]: line.split()[1:] for line in out.getvalue().splitlines() if line.strip()}
     assert lines["edge"] == ["-"] * len(METHODS)
     assert all(float(x) > 0 for x in lines["spot"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,15 @@ import pytest
 from rich.console import Console
 from scene_fakes import sphere
 
+from disco_twin.experiment import keys
 from disco_twin.experiment.experiment import Experiment
+from disco_twin.experiment.keys import code_key, import_closure
 from disco_twin.experiment.run_folder import RunFolder, StageRecord
 from disco_twin.faults.actual_rig import actual_rig
 from disco_twin.light.backend import activate
 from disco_twin.run import stages
 from disco_twin.run.progress import Report
-from disco_twin.run.stages import Run, capture_stages, drop_old_light, pipeline_stage, score_stages, truth_stages
+from disco_twin.run.stages import Run, capture_stages, drop_outdated, pipeline_stage, score_stages, truth_stages
 from pipeline.records import PipelineRecord
 
 
@@ -30,23 +32,20 @@ class Scored(Exception):
 class Recorded(Run):
     """Notes the stages' keys instead of doing them."""
 
-    keys: dict[str, str] = field(default_factory=dict)
-
     def stage(self, name: str, key: str, work: Callable[[Report], Any], unit: str = "") -> None:
-        self.keys[name] = key
+        self.folder.stages[name] = StageRecord(name, key, finished=True)
         if name == "scores":
             raise Scored
 
 
 def keys_of(folder: RunFolder, methods: tuple[str, ...] = ("default",)) -> dict[str, str]:
-    run = Recorded(sphere(), folder, folder.scene_file, methods, Console(quiet=True))
+    run = Recorded(sphere(faults={"deviation": True}, spots=200), folder, folder.scene_file, methods, QUIET)
     capture_stages(run)
     truth_stages(run)
     pipeline_stage(run)
-    folder.stages = {n: StageRecord(n, key, finished=True) for n, key in run.keys.items()}
     with pytest.raises(Scored):
         score_stages(run)
-    return run.keys
+    return {name: record.key for name, record in folder.stages.items()}
 
 
 @pytest.fixture
@@ -59,60 +58,84 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
     return RunFolder.claim(tmp_path / "out", scene, "one")
 
 
-ALL = {"scan", "capture", "truth", "references", "pipeline", "scores"}
+QUIET = Console(quiet=True)
+ALL = {"scan", "targets", "capture", "truth", "references", "pipeline", "scores"}
 
 
 @pytest.mark.parametrize(
-    ("package", "again"),
+    ("module", "again"),
     [
-        *((f"disco_twin.{part}", ALL) for part in ("object", "light", "camera", "emulation.twin_rig", "faults")),
-        ("hw", {"pipeline", "scores"}),
-        ("pipeline", {"pipeline", "scores"}),
-        ("disco_twin.evaluate.scores", {"scores"}),
+        ("disco_twin.object.shapes", ALL - {"targets"}),
+        ("disco_twin.light.walk", ALL - {"targets"}),
+        ("disco_twin.emulation.twin_rig", {"targets", "capture", "pipeline", "scores"}),
+        ("disco_twin.camera.targets", {"targets", "pipeline", "scores"}),
+        ("pipeline.geometry.fresnel", {"truth", "pipeline", "scores"}),
+        ("pipeline.reconstruct.global_term.completion", {"pipeline", "scores"}),
+        ("pipeline.relight.scores", {"scores"}),
+        ("disco_twin.evaluate.summary", set()),
         ("disco_twin.report.page", set()),
+        ("disco_twin.run.stages", set()),
     ],
 )
 def test_changed_code_does_its_stages_again(
-    package: str, again: set[str], folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+    module: str, again: set[str], folder: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before, source_key = keys_of(folder), stages.source_key
-    monkeypatch.setattr(stages, "source_key", lambda name: "changed" if name == package else source_key(name))
+    before, source = keys_of(folder), keys._source
+    assert source(module).is_file()
+    monkeypatch.setattr(keys, "_source", lambda name: folder.scene_file if name == module else source(name))
+    monkeypatch.setattr(stages, "code_key", code_key.__wrapped__)  # no cache
     after = keys_of(folder)
     assert set(before) == ALL
     assert {name for name in ALL if before[name] != after[name]} == again
+
+
+def test_the_closure_holds_what_is_imported_in_functions_and_the_packages_on_the_way() -> None:
+    found = import_closure("disco_twin.experiment.experiment")
+    assert {"disco_twin.light.transport", "pipeline.plan.plan", "disco_twin.light", "hw"} <= {*found}
+    assert "disco_twin.scene.scene" not in found  # for type checking alone
+    assert {"pipeline.reconstruct.baselines.dipole"} <= {*import_closure("pipeline.reconstruct")}
 
 
 def test_scores_of_other_methods_are_other_scores(folder: RunFolder) -> None:
     one, two = keys_of(folder), keys_of(folder, ("default", "dipole"))
     assert {name for name in ALL if one[name] != two[name]} == {"pipeline", "scores"}
     folder.stages = {n: StageRecord(n, one[n], finished=True) for n in ALL}  # the same pipeline run, scored anew
-    run = Recorded(sphere(), folder, folder.scene_file, ("dipole",), Console(quiet=True))
+    run = Recorded(sphere(), folder, folder.scene_file, ("dipole",), QUIET)
     with pytest.raises(Scored):
         score_stages(run)
-    assert run.keys["scores"] != one["scores"]
+    assert folder.stages["scores"].key != one["scores"]
 
 
-def test_old_light_goes_when_its_code_changed(folder: RunFolder) -> None:
-    drop_old_light(folder, "a")
-    light = [folder.capture / name for name in ("images.bin", "journal.bin", "plan.json")]
-    light += [folder.twin / "responses" / "spots-1.npy", folder.twin / "references" / "uniform@left.exr"]
-    kept = [folder.capture / "scan.ply", folder.work / "model-default.npz"]
-    for path in light + kept:
-        path.parent.mkdir(exist_ok=True)
-        path.write_bytes(b"x")
-    drop_old_light(folder, "a")
-    assert all(path.exists() for path in light + kept)
-    drop_old_light(folder, "b")
-    assert not any(path.exists() for path in light)
-    assert all(path.exists() for path in kept)
+def test_what_old_code_left_is_not_continued(folder: RunFolder) -> None:
+    left = {
+        "capture": [folder.capture / name for name in ("images.bin", "journal.bin", "plan.json")],
+        "spots": [folder.twin / "responses" / "spots-1.npy"],
+        "references": [folder.twin / "references" / "uniform@left.exr"],
+        "targets": [folder.capture / "calibration" / "front" / name for name in ("images.bin", "bracket/images.bin")],
+    }
+    kept = [folder.capture / "scan.ply", folder.work / "model-default.npz", folder.capture / "rig.json"]
+    for stage, files in left.items():
+        drop_outdated(folder, stage, "a")
+        for path in files + kept:
+            path.parent.mkdir(exist_ok=True, parents=True)
+            path.write_bytes(b"x")
+        drop_outdated(folder, stage, "a")
+        assert all(path.exists() for path in files)
+    for stage, files in left.items():
+        drop_outdated(folder, stage, "b")
+        assert not any(path.exists() for path in files)
+        others = [
+            path for name, paths in left.items() if list(left).index(name) > list(left).index(stage) for path in paths
+        ]
+        assert all(path.exists() for path in others + kept)
 
 
 def test_stored_spots_belong_to_object_cameras_and_beam() -> None:
     activate()
     from disco_twin.light.response import light_key
 
-    def key(world: Experiment, seed: int = 0, scale: float = 1.0, **medium: object) -> str:
-        obj, rig = world.object, world.scene.rig
+    def key(experiment: Experiment, seed: int = 0, scale: float = 1.0, **medium: object) -> str:
+        obj, rig = experiment.object, experiment.scene.rig
         mesh = obj.mesh.copy()
         mesh.vertices = np.asarray(mesh.vertices) * scale
         obj = replace(obj, mesh=mesh, medium=replace(obj.medium, **medium))  # type: ignore[arg-type]

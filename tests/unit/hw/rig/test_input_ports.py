@@ -162,7 +162,7 @@ def test_a_capture_names_the_rig_file_s_keys_and_its_own_copy(
     scene, rig, out = tmp_path / "scene.toml", tmp_path / "rig.toml", tmp_path / "out"
     scene.write_text(SCENE)
     good = rig_file_of(TwinRigConfig(cameras=(RIG.cameras[0],)), {})
-    monkeypatch.setattr("disco_twin.run.simulate.twin_rig", lambda world, folder: TwinRig(world.scene.rig, Glow(), 5))
+    monkeypatch.setattr("disco_twin.run.simulate.twin_rig", lambda x, _: TwinRig(x.scene.rig, Glow(), 5))
     command = ("capture", scene, "--out", out, "--rig", rig)
     rig.write_text(good.replace('kind = "mm-ard"\nport = "emulated"', 'kind = "mm-ard"\nport = "/dev/none"'))
     assert says(*command).startswith(

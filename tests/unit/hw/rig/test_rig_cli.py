@@ -215,7 +215,7 @@ def test_devices_capture_into_a_run_folder_and_nothing_simulates_over_it(
     scene, rig, out = tmp_path / "scene.toml", tmp_path / "rig.toml", tmp_path / "out"
     scene.write_text(SCENE)
     rig.write_text(rig_file_of(TwinRigConfig(cameras=(RIG.cameras[0],)), {}))
-    monkeypatch.setattr("disco_twin.run.simulate.twin_rig", lambda world, folder: TwinRig(world.scene.rig, Glow(), 5))
+    monkeypatch.setattr("disco_twin.run.simulate.twin_rig", lambda x, _: TwinRig(x.scene.rig, Glow(), 5))
 
     def command(*words: str) -> tuple[int, str]:
         with pytest.raises(SystemExit) as end:
@@ -226,7 +226,7 @@ def test_devices_capture_into_a_run_folder_and_nothing_simulates_over_it(
     status, said = command("capture", str(scene), "--out", str(out), "--rig", str(rig))
     assert status == 0, said
     images = (out / "capture" / "images.bin").read_bytes()
-    monkeypatch.setattr("disco_twin.run.stages.light_key", lambda run: "changed code")
+    monkeypatch.setattr("disco_twin.run.stages.code_key", lambda *_: "changed code")
     assert command("capture", str(scene), "--out", str(out))[0] == 0
     assert (out / "capture" / "images.bin").read_bytes() == images
     begun_with = (out / "capture" / "devices.toml").read_bytes()
@@ -250,7 +250,7 @@ def test_a_rig_file_is_corrected_before_the_first_image_and_the_pipeline_is_told
     scene, rig, out = tmp_path / "scene.toml", tmp_path / "rig.toml", tmp_path / "out"
     scene.write_text(SCENE)
     rig.write_text(rig_file_of(TwinRigConfig(cameras=(RIG.cameras[0],)), {"board": "/dev/ttyNOBODY"}))
-    monkeypatch.setattr("disco_twin.run.simulate.twin_rig", lambda world, folder: TwinRig(world.scene.rig, Glow(), 5))
+    monkeypatch.setattr("disco_twin.run.simulate.twin_rig", lambda x, _: TwinRig(x.scene.rig, Glow(), 5))
     for port, status in (("/dev/ttyNOBODY", 2), ("emulated", 0)):
         rig.write_text(rig_file_of(TwinRigConfig(cameras=(RIG.cameras[0],)), {"board": port}))
         with pytest.raises(SystemExit) as end:

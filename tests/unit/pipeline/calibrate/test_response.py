@@ -17,9 +17,8 @@ from disco_twin.camera.sensor import gamma_curve
 from disco_twin.camera.targets import TargetSource
 from disco_twin.emulation.twin_rig import BracketRig
 from disco_twin.experiment.experiment import Experiment
-from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.faults.actual_rig import actual_rig
-from disco_twin.run.simulate import take_targets
+from disco_twin.run.targets import take_targets
 from disco_twin.scene.scene import load_scene
 from hw.base.errors import InputError
 from hw.record import RawImage, Sensor, to_radiance
@@ -200,20 +199,21 @@ def test_a_run_photographs_the_bracket_and_the_pipeline_asks_for_it(tmp_path: Pa
     )
     sensor = scene.rig.sensor.model_copy(update={"response": "curved"})
     rig = scene.rig.model_copy(update={"sensor": sensor, "cameras": cameras})
-    world, folder = Experiment(scene.model_copy(update={"rig": rig})), RunFolder(tmp_path)
-    assert not has_targets(folder.capture, rig)
+    scene = scene.model_copy(update={"rig": rig})
+    experiment, capture = Experiment(scene), tmp_path / "capture"
+    assert not has_targets(capture, rig)
     with pytest.raises(InputError, match=r"sensor\.response = .curved.*not linear.*Remedy"):
-        calibrate(folder.capture, rig, lars3_sensor(rig), world.scan, None)
+        calibrate(capture, rig, lars3_sensor(rig), experiment.scan, None)
     earlier = tmp_path / "earlier.json"
     nominal_calibration(rig, lars3_sensor(rig)).save(earlier)
     with pytest.raises(InputError, match=r"earlier\.json: sensor\.response.*not linear.*Remedy"):
-        calibrate(folder.capture, rig, lars3_sensor(rig), world.scan, earlier)
+        calibrate(capture, rig, lars3_sensor(rig), experiment.scan, earlier)
     stored = []
     for _ in range(2):
-        take_targets(world, folder, lambda *_: None)
-        with StreamReader(folder.capture / FOLDER / rig.cameras[0].name / BRACKET) as stream:
+        take_targets(scene, capture, lambda *_: None)
+        with StreamReader(capture / FOLDER / rig.cameras[0].name / BRACKET) as stream:
             assert stream.complete
             assert [int(raw.exponent.min()) for raw in stream] == list(range(rig.sensor.steps))  # type: ignore[union-attr]
             stored.append(stream.bytes_stored)
     assert stored[0] == stored[1]
-    assert has_targets(folder.capture, rig)
+    assert has_targets(capture, rig)

@@ -1,0 +1,60 @@
+"""The tables on the terminal: scores, what each part of the calibration costs, the quality of a capture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from rich.table import Table
+
+from disco_twin.evaluate.summary import figure_or_dash, pooled, rms
+from pipeline.capture.quality import ViewQuality
+
+QUALITY = ("view", "camera", "deg", "images", "saturated", "lit", "range", "dark", "mW")
+
+
+def score_table(summary: dict[str, Any], methods: Sequence[str]) -> Table:
+    """nrmse by light and method."""
+    relit = summary["relit"]
+    table = _table(("nrmse", *methods), "nrmse")
+    for light in dict.fromkeys(r["light"] for r in relit):
+        table.add_row(light, *(figure_or_dash(pooled(relit, method, light)) for method in methods))
+    return table
+
+
+def budget_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """nrmse by calibration and light."""
+    lights = list(dict.fromkeys(row["light"] for row in rows))
+    table = _table(("nrmse, calibration", *lights), "nrmse, calibration")
+    for name in dict.fromkeys(row["calibration"] for row in rows):
+        own = [row for row in rows if row["calibration"] == name]
+        kept = {x: [r["nrmse"] for r in own if r["light"] == x and r["nrmse"] is not None] for x in lights}
+        table.add_row(name, *(figure_or_dash(rms(kept[x]) if kept[x] else None) for x in lights))
+    return table
+
+
+def quality_table(views: Sequence[ViewQuality]) -> Table:
+    """A row for every view."""
+    table = _table(QUALITY, "camera", no_wrap=True)
+    for v in views:
+        table.add_row(
+            str(v.view),
+            v.camera,
+            f"{math.degrees(v.angle_rad):.1f}",
+            f"{v.stored}/{v.planned}",
+            f"{100 * v.saturated:.2f} %",
+            f"{100 * v.significant:.1f} %",
+            f"{v.range_db:.0f} dB" if v.stored else "-",
+            f"{v.dark}/{v.spots}",
+            " ".join("-" if math.isnan(p) else f"{1e3 * p:.2f}" for p in v.power_w),
+        )
+    return table
+
+
+def _table(names: Sequence[str], left: str, no_wrap: bool = False) -> Table:
+    """Columns of figures, and one of names, which starts at the left."""
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for name in names:
+        table.add_column(name, justify="left" if name == left else "right", no_wrap=no_wrap)
+    return table

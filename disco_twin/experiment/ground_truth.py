@@ -1,0 +1,57 @@
+"""The true R_d of a scene: which columns of it are computed, and their computation a few at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_twin.experiment.experiment import Experiment
+from disco_twin.light.balance import EnergyBalance
+from disco_twin.light.truth import Truth, truth_columns
+from disco_twin.object.mesh import hat_basis
+from pipeline.plan.spots import farthest_points
+
+if TYPE_CHECKING:
+    from pipeline.capture.loop import Progress
+
+COLUMNS_AT_ONCE = 4  # between two reports of the progress
+
+
+def columns_of_truth(experiment: Experiment) -> NDArray[np.int64]:
+    """(n,) scan vertices whose column of R_d is computed, spread evenly over the surface."""
+    points = np.asarray(experiment.scan.vertices, float)
+    return np.sort(farthest_points(points, np.ones(len(points)), experiment.scene.simulation.truth_columns))
+
+
+def true_reflectance(experiment: Experiment, columns: Sequence[int] | NDArray[np.int64], walks: int) -> Truth:
+    """The true R_d from these scan vertices to all others, from `walks` photons a column. Needs the renderer."""
+    basis = hat_basis(experiment.object.mesh, experiment.scan)
+    return truth_columns(experiment.transport, basis, np.asarray(columns, np.int64), walks, experiment.seed("truth"))
+
+
+def compute_truth(experiment: Experiment, path: Path, progress: Progress) -> None:
+    """Write the scene's columns of the true R_d, a few at a time."""
+    columns, walks, parts = columns_of_truth(experiment), experiment.scene.simulation.truth_walks, []
+    for low in range(0, len(columns), COLUMNS_AT_ONCE):
+        part = columns[low : low + COLUMNS_AT_ONCE]
+        parts.append(true_reflectance(experiment, part, walks))
+        progress(low + len(part), len(columns))
+    _joined(parts).save(path)
+
+
+def _joined(parts: Sequence[Truth]) -> Truth:
+    """Truth of several sets of columns as one; the balance is the mean over columns."""
+    weights = [len(p.columns) for p in parts]
+    names = EnergyBalance.__dataclass_fields__
+    mean = {k: np.average([getattr(p.balance, k) for p in parts], axis=0, weights=weights) for k in names}
+    return Truth(
+        np.concatenate([p.columns for p in parts]),
+        np.concatenate([p.mean for p in parts], axis=1),
+        np.concatenate([p.standard_error for p in parts], axis=1),
+        parts[0].area,
+        EnergyBalance(**mean),
+    )

@@ -1,0 +1,88 @@
+"""In a copy of the project whose code is changed, stages that import what changed are done again, and only those."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from disco_twin.light.truth import Truth
+
+SCENE = """
+format_version = 1
+name = "sphere"
+[object]
+shape = { kind = "sphere" }
+medium = { base = { kind = "homogeneous", sigma_t_per_mm = 1.0, albedo = 0.9 } }
+[scan]
+vertices = 100
+[simulation]
+walks_per_spot = 200
+truth_columns = 2
+truth_walks = 800
+reference_walks = 200
+[rig]
+spots = 8
+lasers = [{ wavelength_nm = 635.0 }]
+cameras = [{ name = "a", position_mm = [450.0, 0.0, 50.0], width = 32, height = 32 }]
+[relight]
+views = [
+    { name = "b", position_mm = [450.0, 0.0, 50.0], width = 32, height = 32 },
+    { name = "c", position_mm = [450.0, 50.0, 50.0], width = 32, height = 32 },
+]
+lights = [{ kind = "uniform", name = "uniform", colour = [1.0] }]
+"""
+PROGRAM = """
+from pathlib import Path
+from rich.console import Console
+from disco_twin.run.stages import begin_run, capture_stages, truth_stages
+run = begin_run(Path("scene.toml"), Path("out"), "full", "default", Console())
+capture_stages(run)
+truth_stages(run)
+"""
+HALF = """
+
+_whole = mean_transmittance
+
+
+def mean_transmittance(eta: float) -> float:
+    return _whole(eta) / 2
+"""
+
+
+@pytest.fixture
+def project(tmp_path: Path, repository: Path) -> Path:
+    for floor in ("hw", "pipeline", "disco_twin"):
+        shutil.copytree(repository / floor, tmp_path / floor, ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "scene.toml").write_text(SCENE)
+    return tmp_path
+
+
+def stages_done(project: Path) -> set[str]:
+    """Simulate in the copy; the stages that were not finished before."""
+    environment = os.environ | {"PYTHONPATH": str(project)}
+    program = [sys.executable, "-c", PROGRAM]
+    end = subprocess.run(program, cwd=project, env=environment, capture_output=True, text=True, check=False)
+    assert end.returncode == 0, end.stderr
+    return {line.split()[0] for line in end.stdout.splitlines() if " MiB" in line}
+
+
+def test_truth_is_computed_again_when_what_it_imports_has_changed_and_only_then(project: Path) -> None:
+    """Truth divides by the square of the mean transmittance: with half of it, the truth of before is four times off."""
+    truth = project / "out" / "twin" / "truth.npz"
+    assert stages_done(project) == {"scan", "capture", "truth", "references"}
+    before, captured = Truth.load(truth), (project / "out" / "capture" / "images.bin").stat()
+    with (project / "pipeline" / "geometry" / "fresnel.py").open("a") as file:
+        file.write(HALF)
+    assert stages_done(project) == {"truth"}
+    np.testing.assert_allclose(Truth.load(truth).mean, 4 * before.mean)
+    for not_imported in ("disco_twin/report/page.py", "disco_twin/evaluate/summary.py", "pipeline/relight/scores.py"):
+        with (project / not_imported).open("a") as file:
+            file.write("CHANGED = True\n")
+    assert stages_done(project) == set()
+    assert (project / "out" / "capture" / "images.bin").stat() == captured
