@@ -148,7 +148,7 @@ def undisturbed(folder: Path) -> Undisturbed:
     clock = Timetable()
     emulation = Emulation(TwinRig(RIG, Glow(), SEED), clock)
     sent: Counter[str] = Counter()
-    for name, line in emulation.lines.items():
+    for name, line in emulation.cables.items():
         setattr(line, "receive", _counting(line.receive, name, sent))  # noqa: B010 - a spy on one line
     capture(emulation.serial_rig(), plan(), folder)
     assert emulation.bench.hazards == []
@@ -165,7 +165,7 @@ def _counting(receive: Callable[[bytes], None], name: str, sent: Counter[str]) -
 
 def arm(fault: Fault, emulation: Emulation, whole: Undisturbed, state: Path) -> None:
     """Prepare the fault."""
-    line, clock = emulation.lines[fault.line], emulation.clock
+    line, clock = emulation.cables[fault.line], emulation.clock
     assert isinstance(clock, Timetable)
     if fault.kind in MESSAGE_KINDS:
         before = int(fault.when * whole.messages[fault.line])
@@ -217,7 +217,7 @@ def revived(state: Path) -> Emulation:
 
 def mend(emulation: Emulation) -> None:
     """What an operator does: plug in, close the interlock, turn the key on, restart what reports a fault."""
-    for line in emulation.lines.values():
+    for line in emulation.cables.values():
         line.plug()
         line.answer_faults.clear()
         line.command_faults.clear()
@@ -225,7 +225,7 @@ def mend(emulation: Emulation) -> None:
         if head.failures or not head.key:
             head.set_interlock(True)
             head.set_key(True)
-            emulation.lines[f"laser{index}"].power_cycle()
+            emulation.cables[f"laser{index}"].power_cycle()
 
 
 @dataclass(frozen=True)
@@ -295,7 +295,7 @@ def _not_dark(emulation: Emulation) -> list[str]:
     bench, now = emulation.bench, emulation.clock.now()
     left = [f"laser {i} falls on the object" for i in bench.light()]
     for index, head in enumerate(bench.heads):
-        if emulation.lines[f"laser{index}"].plugged and head.emission(now) > 0:
+        if emulation.cables[f"laser{index}"].plugged and head.emission(now) > 0:
             left.append(f"laser {index} emits")
     return left
 

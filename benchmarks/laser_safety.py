@@ -145,8 +145,8 @@ def watched(numbers: Sequence[int]) -> tuple[list[Trial], list[str]]:
     trials = []
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        lasers = {name: line for name, line in emulation.lines.items() if name.startswith("laser")}
-        with Server(emulation.lines, folder) as ports:
+        lasers = {name: line for name, line in emulation.cables.items() if name.startswith("laser")}
+        with Server(emulation.cables, folder) as ports:
             (folder / "rig.toml").write_text(rig_file_of(RIG, ports.urls))
             for number in numbers:
                 event = EVENTS[number % len(EVENTS)]
@@ -189,7 +189,7 @@ def _captured(context: Any, emulation: Emulation, folder: Path, event: str, numb
 def _connected(context: Any, emulation: Emulation, urls: dict[str, str], number: int) -> float | None:
     """Milliseconds of light after the port of a laser that is on was opened (a socket, which knows when that is)."""
     name = f"laser{number // len(EVENTS) % len(emulation.bench.heads)}"
-    line, head = emulation.lines[name], emulation.bench.heads[int(name[-1])]
+    line, head = emulation.cables[name], emulation.bench.heads[int(name[-1])]
     opened: list[float] = []
     before = line.opened
 

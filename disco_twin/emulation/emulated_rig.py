@@ -14,7 +14,7 @@ from disco_twin.emulation.rig_file_of import emulated_rig_file
 from disco_twin.emulation.twin_rig import TwinRig
 from disco_twin.firmware.mm_ard import MmArdFirmware
 from disco_twin.firmware.omicron import OmicronFirmware
-from disco_twin.firmware.wire import Line
+from disco_twin.firmware.wire import Cable
 from disco_twin.firmware.zaber import ZaberFirmware
 from hw.base.clock import Clock, VirtualClock, WallClock
 from hw.rig.connect import Connector, StandIns
@@ -27,21 +27,21 @@ _NUMBERS = itertools.count()
 
 
 class Emulation:
-    """The devices of a twin as firmware on lines. `lines` by name: laser0 .., board, turntable."""
+    """The devices of a twin as firmware on lines. `cables` by name: laser0 .., board, turntable."""
 
     def __init__(self, twin: TwinRig, clock: Clock | None = None) -> None:
         self.clock: Clock = VirtualClock() if clock is None else clock
         self.bench = Bench(twin, self.clock)
-        self.lines = {f"laser{i}": Line(OmicronFirmware(head), self.clock) for i, head in enumerate(self.bench.heads)}
+        self.cables = {f"laser{i}": Cable(OmicronFirmware(head), self.clock) for i, head in enumerate(self.bench.heads)}
         for i in range(len(self.bench.heads)):
-            self.lines[f"laser{i}"].on_closed = partial(self.bench.left, i)
-        self.lines["board"] = Line(MmArdFirmware(self.bench.board), self.clock)
-        self.lines["turntable"] = Line(ZaberFirmware(self.bench.spindle), self.clock)
+            self.cables[f"laser{i}"].on_closed = partial(self.bench.left, i)
+        self.cables["board"] = Cable(MmArdFirmware(self.bench.board), self.clock)
+        self.cables["turntable"] = Cable(ZaberFirmware(self.bench.spindle), self.clock)
 
     def attach(self) -> dict[str, str]:
         """Make every line a memory port; URLs by name."""
         number = next(_NUMBERS)
-        return {name: attach(f"emulated-{number}-{name}", line) for name, line in self.lines.items()}
+        return {name: attach(f"emulated-{number}-{name}", line) for name, line in self.cables.items()}
 
     def stand_ins(self, ports: Mapping[str, str] | None = None, *, cameras: bool = True) -> StandIns:
         """What stands in for devices that are not there.

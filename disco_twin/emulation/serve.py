@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol, Self
 
-from disco_twin.firmware.wire import Line
+from disco_twin.firmware.wire import Cable
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ class Port(Protocol):
 class PtyPort:
     """A pseudo-terminal with a name of its own: a link in a folder."""
 
-    def __init__(self, line: Line, link: Path) -> None:
+    def __init__(self, line: Cable, link: Path) -> None:
         self.line, self.link = line, link
         self.fd, self._slave = pty.openpty()  # the slave stays open: without it the master fails between two users
         tty.setraw(self._slave)
@@ -68,7 +68,7 @@ class PtyPort:
 class TcpPort:
     """A port of 127.0.0.1; one user at a time."""
 
-    def __init__(self, line: Line) -> None:
+    def __init__(self, line: Cable) -> None:
         self.line = line
         self._server = socket.create_server(("127.0.0.1", 0))
         self._user: socket.socket | None = None
@@ -117,7 +117,7 @@ class TcpPort:
 class Server:
     """Serves lines between `__enter__` and `__exit__`; `urls` by name. `folder`: of the terminals, None for TCP."""
 
-    def __init__(self, lines: Mapping[str, Line], folder: Path | None) -> None:
+    def __init__(self, lines: Mapping[str, Cable], folder: Path | None) -> None:
         self._lines, self._folder = dict(lines), folder
         self._ports: dict[str, Port] = {}
         self._selector = selectors.DefaultSelector()
@@ -177,7 +177,7 @@ class Server:
             coming = any(line.next_arrival() < math.inf for line in self._lines.values())
         return POLL_S if coming else IDLE_S
 
-    def _send(self, line: Line, fd: int) -> None:
+    def _send(self, line: Cable, fd: int) -> None:
         data = line.deliver(4096, 0.0)
         if data:
             try:

@@ -57,7 +57,7 @@ def emulated_devices(scene: TwinRigConfig, seed: int) -> Emulation:
 def served(scene: TwinRigConfig, seed: int, folder: Path) -> Iterator[Path]:
     """Emulated devices on pseudo-terminals in a folder, and the rig file that reaches them."""
     require_folder(folder, "--ports")
-    lines, path = emulated_devices(scene, seed).lines, folder / "rig.toml"
+    lines, path = emulated_devices(scene, seed).cables, folder / "rig.toml"
     remedy = "choose another --ports, or take it away"
     with _alone_in(folder):
         for port in (folder / name for name in lines):

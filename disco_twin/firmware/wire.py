@@ -1,6 +1,6 @@
 """The line between a computer and an emulated device: baud rate, latency, and everything that goes wrong on a cable.
 
-A device's firmware is a pure state machine: bytes in, timed bytes out. `Line` lets its answers arrive when a real line
+A device's firmware is a pure state machine: bytes in, timed bytes out. `Cable` lets its answers arrive when a real line
 would deliver them, and implements `hw.serial.ports.protocol_memory.Peer`, so that drivers reach it as `memory://NAME`.
 """
 
@@ -97,7 +97,7 @@ def broken_by(message: bytes, at: int) -> Fault:
 # ---- the line
 
 
-class Line:
+class Cable:
     """A device on its line. Faults are queued: each befalls one answer, or one write of the computer."""
 
     def __init__(self, firmware: Firmware, clock: Clock) -> None:

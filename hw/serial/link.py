@@ -18,7 +18,7 @@ import serial
 from hw.base.clock import Clock
 from hw.base.errors import DeviceError, Garbled, NoAnswer, SwitchedOff, Unplugged, WrongDevice
 from hw.safety.guard import FAILURES, GuardClosed
-from hw.safety.ports.protocol_guard import Serial as GuardedPort
+from hw.safety.ports.protocol_guard import GuardedPort
 from hw.serial.bytelog import ByteLog
 
 log = logging.getLogger(__name__)

@@ -18,7 +18,7 @@ from contextlib import ExitStack, suppress
 import pytest
 
 from hw.base.clock import WallClock
-from hw.safety.ports.protocol_guard import Serial
+from hw.safety.ports.protocol_guard import GuardedPort
 from hw.serial.link import Link
 
 LIMIT_S = 1.0  # on a busy machine; the benchmark measures the 100 ms
@@ -94,7 +94,7 @@ def wait(laser: Laser, on: bool, limit_s: float = 5.0) -> None:
         time.sleep(0.002)
 
 
-def said_by(port: Serial) -> bytes:
+def said_by(port: GuardedPort) -> bytes:
     """Its next answer, without the CR."""
     got, end = b"", time.monotonic() + 2.0
     while not (plain := re.sub(rb"\$[^\r]*\r|\0", b"", got)).endswith(b"\r"):
@@ -106,8 +106,8 @@ def said_by(port: Serial) -> bytes:
 PROGRAM = """
 import signal, sys, threading, time
 from hw.safety.guard import GuardClosed
-from hw.safety.ports.protocol_guard import Serial
-port = Serial("guard://" + sys.argv[1], baudrate=500000, timeout=0.5, write_timeout=1)
+from hw.safety.ports.protocol_guard import GuardedPort
+port = GuardedPort("guard://" + sys.argv[1], baudrate=500000, timeout=0.5, write_timeout=1)
 port.write(b"?LOn\\r")
 if sys.argv[2] == "deaf":  # a main thread that never gets to its signal handlers: one long step of C
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
@@ -179,13 +179,16 @@ def lasers() -> Iterator[Callable[..., Laser]]:
         laser.close()
 
 
+Opening = Callable[[Laser], GuardedPort]
+
+
 @pytest.fixture
-def ports() -> Iterator[Callable[[Laser], Serial]]:
+def ports() -> Iterator[Opening]:
     """Opens guarded ports, and closes those that a test that fails leaves open."""
     with ExitStack() as left:
 
-        def open_port(laser: Laser) -> Serial:
-            port = Serial("guard://" + laser.port, baudrate=500000, timeout=0.5, write_timeout=1)
+        def open_port(laser: Laser) -> GuardedPort:
+            port = GuardedPort("guard://" + laser.port, baudrate=500000, timeout=0.5, write_timeout=1)
             left.callback(port.close)
             return port
 

@@ -79,7 +79,7 @@ def reset(emulated: Emulation) -> None:
 
 def at_message(emulated: Emulation, wanted: Callable[[bytes, int], bool], action: Callable[[], None]) -> None:
     """Do something, and lose the message, when the board is sent a certain one."""
-    line, number = emulated.lines["board"], 0
+    line, number = emulated.cables["board"], 0
     receive = line.receive
 
     def received(data: bytes) -> None:

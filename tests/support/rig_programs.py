@@ -61,7 +61,7 @@ def devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
     """The devices, their server, and a rig file of the board and one laser."""
     emulated = quick(monkeypatch)
     (tmp_path / "ports").mkdir()
-    with Server(emulated.lines, tmp_path / "ports") as server:
+    with Server(emulated.cables, tmp_path / "ports") as server:
         urls = server.urls
         (tmp_path / "rig.toml").write_text(rig_file_of(ONE_LASER, {name: urls[name] for name in ("laser0", "board")}))
         (tmp_path / "scene.toml").write_text(ONE_LASERS_SCENE)

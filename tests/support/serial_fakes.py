@@ -12,7 +12,7 @@ from disco_twin.firmware.mm_ard import MirrorHead, MmArdFirmware
 from disco_twin.firmware.omicron import LaserHead, OmicronFirmware
 from disco_twin.firmware.ophir import OphirFirmware
 from disco_twin.firmware.turning import Spindle
-from disco_twin.firmware.wire import Firmware, Line
+from disco_twin.firmware.wire import Cable, Firmware
 from disco_twin.firmware.zaber import MICROSTEPS_PER_DEG, ZaberFirmware
 from hw.base.clock import VirtualClock
 from hw.devices.elliptec import ElliptecTable
@@ -35,7 +35,7 @@ class Bus:
     log: Path | None = None
 
     def __post_init__(self) -> None:
-        self.line = Line(self.firmware, self.clock)
+        self.line = Cable(self.firmware, self.clock)
         self.url = attach(self.name, self.line)
 
     def link(self, device: str) -> Link:

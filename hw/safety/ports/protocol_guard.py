@@ -78,7 +78,7 @@ def _hung_up(host: socket.socket) -> bool:
     return bool(poll.poll(0))
 
 
-class Serial(SerialBase):
+class GuardedPort(SerialBase):
     """The program's end of a guarded port."""
 
     _host: socket.socket | None = None
@@ -243,6 +243,6 @@ class Serial(SerialBase):
         """The guard set the baud rate when it opened the port."""
 
 
-def serial_class_for_url(url: str) -> tuple[str, type[Serial]]:
+def serial_class_for_url(url: str) -> tuple[str, type[GuardedPort]]:
     """What `serial.serial_for_url` asks a handler for."""
-    return url, Serial
+    return url, GuardedPort

@@ -45,7 +45,7 @@ def detach(name: str) -> None:
     _PEERS.pop(name.lower(), None)
 
 
-class Serial(SerialBase):
+class MemoryPort(SerialBase):
     """The computer's end of a memory port."""
 
     _peer: Peer | None = None
@@ -118,6 +118,6 @@ class Serial(SerialBase):
         """A memory port has no settings."""
 
 
-def serial_class_for_url(url: str) -> tuple[str, type[Serial]]:
+def serial_class_for_url(url: str) -> tuple[str, type[MemoryPort]]:
     """What `serial.serial_for_url` asks a handler for."""
-    return url.lower(), Serial
+    return url.lower(), MemoryPort

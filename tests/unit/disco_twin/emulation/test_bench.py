@@ -162,11 +162,11 @@ def stall(emulated: Emulation) -> None:
 FAULTS: dict[str, tuple[Callable[[Emulation], None], str]] = {
     "interlock": (lambda e: e.bench.heads[1].set_interlock(closed=False), "laser 532 nm gives 0.00 mW"),
     "key": (lambda e: e.bench.heads[1].set_key(on=False), "laser 532 nm gives 0.00 mW"),
-    "laser's power": (lambda e: e.lines["laser1"].power_cycle(), "laser 532 nm gives 0.00 mW"),
-    "board unplugged": (lambda e: e.lines["board"].unplug(), "mirror board"),
-    "board's power": (lambda e: e.lines["board"].power_cycle(), "mirror board|gives 0.00 mW|TTL lines"),
-    "turntable unplugged": (lambda e: e.lines["turntable"].unplug(), "turntable"),
-    "turntable's power": (lambda e: e.lines["turntable"].power_cycle(), "turntable"),
+    "laser's power": (lambda e: e.cables["laser1"].power_cycle(), "laser 532 nm gives 0.00 mW"),
+    "board unplugged": (lambda e: e.cables["board"].unplug(), "mirror board"),
+    "board's power": (lambda e: e.cables["board"].power_cycle(), "mirror board|gives 0.00 mW|TTL lines"),
+    "turntable unplugged": (lambda e: e.cables["turntable"].unplug(), "turntable"),
+    "turntable's power": (lambda e: e.cables["turntable"].power_cycle(), "turntable"),
     "stall": (stall, "turntable has stalled"),
 }
 
@@ -180,7 +180,7 @@ def test_a_fault_in_mid_scan_stops_it_with_its_reason_and_costs_no_image(name: s
     at_image(4, act)(emulated)
     with pytest.raises(DiscoError, match=message):
         capture(emulated.serial_rig(), PLAN, tmp_path / "parts")
-    reachable = [h for i, h in enumerate(emulated.bench.heads) if emulated.lines[f"laser{i}"].plugged]
+    reachable = [h for i, h in enumerate(emulated.bench.heads) if emulated.cables[f"laser{i}"].plugged]
     assert all(head.emission(emulated.clock.now()) == 0.0 for head in reachable)
     with StreamReader(tmp_path / "parts") as stored:
         assert 3 <= len(stored) < len(PLAN)
@@ -210,6 +210,6 @@ def test_nothing_works_outside_with(emulated: Emulation) -> None:
     rig.floodlight.off()
     rig.lasers[0].close_gate()
     rig.make_safe()
-    emulated.lines["turntable"].unplug()
+    emulated.cables["turntable"].unplug()
     with pytest.raises(Unplugged, match="turntable"), rig:
         raise AssertionError

@@ -36,7 +36,7 @@ def test_capture_through_serial_lines_equals_the_direct_twin(tmp_path: Path) -> 
     capture(emulated.serial_rig(tmp_path / "logs"), PLAN, serial)
     assert contents(serial) == contents(direct)
     assert emulated.bench.hazards == []
-    assert sorted(p.name for p in (tmp_path / "logs").iterdir()) == sorted(f"{n}.log" for n in emulated.lines)
+    assert sorted(p.name for p in (tmp_path / "logs").iterdir()) == sorted(f"{n}.log" for n in emulated.cables)
 
 
 @pytest.mark.parametrize("fail_at", [0, 1, 7, 11, 21])

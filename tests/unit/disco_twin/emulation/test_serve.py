@@ -25,7 +25,7 @@ from disco_twin.firmware.elliptec import ElliptecFirmware
 from disco_twin.firmware.mm_ard import MirrorHead, MmArdFirmware
 from disco_twin.firmware.omicron import LaserHead, OmicronFirmware
 from disco_twin.firmware.turning import Spindle
-from disco_twin.firmware.wire import Line
+from disco_twin.firmware.wire import Cable
 from disco_twin.firmware.zaber import MICROSTEPS_PER_DEG, ZaberFirmware
 from hw.base.clock import VirtualClock
 from hw.base.errors import Unplugged
@@ -46,9 +46,9 @@ class Desk:
         self.clock = ScaledClock()
         self.head, self.mirrors, self.spindle = LaserHead(532.0, 100.0), MirrorHead(), Spindle(30.0)
         self.lines = {
-            "laser": Line(OmicronFirmware(self.head), self.clock),
-            "board": Line(MmArdFirmware(self.mirrors), self.clock),
-            "turntable": Line(ZaberFirmware(self.spindle), self.clock),
+            "laser": Cable(OmicronFirmware(self.head), self.clock),
+            "board": Cable(MmArdFirmware(self.mirrors), self.clock),
+            "turntable": Cable(ZaberFirmware(self.spindle), self.clock),
         }
 
 
@@ -64,7 +64,7 @@ def test_a_laser_whose_port_nobody_holds_is_seen_on_sockets_alone(tmp_path: Path
     """A terminal does not say when it is closed (decision 0036): what stands in for it must not rely on this."""
     emulated = emulated_devices(RIG, seed=1)
     head = emulated.bench.heads[0]
-    with Server({"laser0": emulated.lines["laser0"]}, tmp_path if through == "terminals" else None) as server:
+    with Server({"laser0": emulated.cables["laser0"]}, tmp_path if through == "terminals" else None) as server:
         head.mode, head.level, head.on_since = int(Mode.BIAS | Mode.RELEASE), 1.0, time.monotonic() - 60.0
         with serial.serial_for_url(server.urls["laser0"], timeout=2.0) as port:
             port.write(b"?GAS\r")
@@ -139,7 +139,7 @@ def test_a_capture_through_terminals_equals_the_direct_twin(tmp_path: Path) -> N
     emulated = Emulation(TwinRig(RIG, Glow(), seed=5), ScaledClock())
     ports = tmp_path / "ports"
     ports.mkdir()
-    with Server(emulated.lines, ports) as server:
+    with Server(emulated.cables, ports) as server:
         capture(emulated.serial_rig(urls=server.urls), PLAN, tmp_path / "serial")
     assert contents(tmp_path / "serial") == contents(tmp_path / "direct")
     assert emulated.bench.hazards == []
@@ -237,7 +237,7 @@ def test_a_published_elliptec_client_turns_the_emulated_stage(tmp_path: Path) ->
     """Outside check: the client thorlabs-elliptec."""
     elliptec = pytest.importorskip("thorlabs_elliptec")
     clock, spindle = ScaledClock(), Spindle(30.0)
-    with Server({"stage": Line(ElliptecFirmware(spindle), clock)}, tmp_path) as server:
+    with Server({"stage": Cable(ElliptecFirmware(spindle), clock)}, tmp_path) as server:
         stage = elliptec.ELLx(serial_port=server.urls["stage"], x=14)
         stage.home()
         stage.move_absolute(120.0, blocking=True)

@@ -10,7 +10,7 @@ from serial_fakes import BoardBench, LaserBench
 from disco_twin.firmware.mm_ard import Galvo
 from disco_twin.firmware.omicron import LaserHead, OmicronFirmware
 from disco_twin.firmware.turning import Spindle
-from disco_twin.firmware.wire import Line, Timed, late, lost, split
+from disco_twin.firmware.wire import Cable, Timed, late, lost, split
 from hw.base.clock import VirtualClock
 
 
@@ -32,7 +32,7 @@ class Echo:
         return [(self.delays[i % len(self.delays)], bytes([byte])) for i, byte in enumerate(data)]
 
 
-def read_all(line: Line, clock: VirtualClock) -> list[tuple[float, bytes]]:
+def read_all(line: Cable, clock: VirtualClock) -> list[tuple[float, bytes]]:
     got = []
     while data := line.deliver(100, 10.0):
         got.append((clock.now(), data))
@@ -42,7 +42,7 @@ def read_all(line: Line, clock: VirtualClock) -> list[tuple[float, bytes]]:
 def test_baud_rate_and_latency_of_a_laser() -> None:
     """?GFw CR is 5 bytes, the answer 16: at 57600 baud, 8N1, with 15 ms in between."""
     clock = VirtualClock()
-    line = Line(OmicronFirmware(LaserHead(532.0, 100.0), baud=57_600), clock)
+    line = Cable(OmicronFirmware(LaserHead(532.0, 100.0), baud=57_600), clock)
     line.opened()
     line.receive(b"?GFw\r")
     ((time, data),) = read_all(line, clock)[:1]
@@ -75,7 +75,7 @@ def test_times_of_the_devices() -> None:
 @given(st.lists(st.sampled_from([None, late(0.5), late(2.0), split(0), split(1)]), max_size=8), st.binary(min_size=8))
 def test_whatever_is_late_the_order_is_kept(faults: list[object], data: bytes) -> None:
     clock = VirtualClock()
-    line = Line(Echo([0.01]), clock)
+    line = Cable(Echo([0.01]), clock)
     line.opened()
     line.answer_faults.extend(faults)  # type: ignore[arg-type]
     line.receive(data)
@@ -85,7 +85,7 @@ def test_whatever_is_late_the_order_is_kept(faults: list[object], data: bytes) -
 
 def test_an_answer_that_takes_long_does_not_hold_up_the_next_one() -> None:
     clock = VirtualClock()
-    line = Line(Echo([3.0, 0.1]), clock)
+    line = Cable(Echo([3.0, 0.1]), clock)
     line.opened()
     line.receive(b"ab")
     assert [d for _, d in read_all(line, clock)] == [b"b", b"a"]

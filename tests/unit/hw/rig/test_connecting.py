@@ -42,7 +42,7 @@ def silent(name: str) -> Callable[[Emulation], None]:
     """A device whose adapter lives, and which hears nothing."""
 
     def fall(emulated: Emulation) -> None:
-        emulated.lines[name].firmware.feed = lambda data, now: []  # type: ignore[method-assign]
+        emulated.cables[name].firmware.feed = lambda data, now: []  # type: ignore[method-assign]
 
     return fall
 
@@ -56,7 +56,7 @@ def test_a_device_that_fails_leaves_nothing_else_lit(tmp_path: Path, fault: str)
         silent(name)(emulated)
     connect = connector(emulated, tmp_path)
     if kind == "unplugged":
-        emulated.lines[name].unplug()
+        emulated.cables[name].unplug()
     with pytest.raises(DeviceError, match={"laser0": "laser 635 nm", "laser1": "laser 532 nm"}.get(name, name)):
         connect.connect()
     assert emulated.bench.board.lines == 0
@@ -66,7 +66,7 @@ def test_a_device_that_fails_leaves_nothing_else_lit(tmp_path: Path, fault: str)
 def test_a_board_that_fails_leaves_no_laser_on(tmp_path: Path) -> None:
     emulated = left_on()
     connect = connector(emulated, tmp_path)
-    emulated.lines["board"].unplug()
+    emulated.cables["board"].unplug()
     with pytest.raises(DeviceError, match="mirror board"):
         connect.connect()
     assert not any(head.on_since for head in emulated.bench.heads)

@@ -115,7 +115,7 @@ def test_ports_that_were_all_pulled_are_closed_in_the_time_of_one(
     assert 2.0 <= time.monotonic() - begun < 3.5 and not rig.connected
     heads = emulated.bench.heads
     assert all(head.on_since for head in heads)
-    for name in emulated.lines:
+    for name in emulated.cables:
         server.plug(name)
     assert [guard.wait(10) for guard in guards] == [IS_OFF] * 3
     assert not any(head.on_since for head in heads)
@@ -129,7 +129,7 @@ def test_a_laser_that_has_fallen_silent_is_waited_for_once(whole: Bench, monkeyp
     rig = serial_rig(path)
     rig.__enter__()
     rig.lasers[0].open_gate()
-    firmware, guard = emulated.lines["laser0"].firmware, rig.drivers().lasers[0].link._port._guard  # type: ignore[attr-defined]
+    firmware, guard = emulated.cables["laser0"].firmware, rig.drivers().lasers[0].link._port._guard  # type: ignore[attr-defined]
     hear = firmware.feed
     firmware.feed = lambda data, now: []  # type: ignore[method-assign]
     begun = time.monotonic()

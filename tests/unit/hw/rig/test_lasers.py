@@ -32,7 +32,7 @@ def test_lasers_are_read_before_every_view_and_written_down(tmp_path: Path) -> N
 
 def weaken(emulated: Emulation, laser: int, share: float) -> None:
     """The head gives less than it is set to; what comes through its gate does not change (its reading is asked for)."""
-    firmware = emulated.lines[f"laser{laser}"].firmware
+    firmware = emulated.cables[f"laser{laser}"].firmware
     feed = firmware.feed
 
     def weaker(data: bytes, now: float) -> list[tuple[float, bytes]]:
@@ -68,7 +68,7 @@ def test_a_laser_that_drifts_is_marked(tmp_path: Path, caplog: pytest.LogCapture
 def test_one_garbled_power_reading_stops_nothing(tmp_path: Path) -> None:
     emulated = emulation()
     with emulated.serial_rig() as rig:
-        emulated.lines["laser0"].answer_faults.append(lambda data: [(0.0, data.replace(b"10.", b"70."))])
+        emulated.cables["laser0"].answer_faults.append(lambda data: [(0.0, data.replace(b"10.", b"70."))])
         assert [reading.own_w for reading in rig.check()] == pytest.approx([0.01] * 3)
 
 

@@ -173,7 +173,7 @@ def test_an_armed_selftest_finds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
     def reset_at_start() -> None:
         start()
-        devices.lines["board"].power_cycle()
+        devices.cables["board"].power_cycle()
 
     if fault == "leaks":
         monkeypatch.setattr(bench.board, "sample", leak)

@@ -238,7 +238,7 @@ def devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[E
     monkeypatch.setattr("disco_twin.firmware.turning.SPEED_DEG_S", 720.0)
     (tmp_path / "ports").mkdir()
     emulation = emulated_devices(FAST, seed=9)
-    with Server(emulation.lines, tmp_path / "ports") as server:
+    with Server(emulation.cables, tmp_path / "ports") as server:
         yield emulation, server.urls
 
 

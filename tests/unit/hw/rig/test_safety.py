@@ -35,7 +35,7 @@ def test_a_board_that_was_reset_never_gives_an_image(tmp_path: Path) -> None:
         if when == "aimed":  # the lines are read (2) before the gate opens for the second spot
             at_message(emulated, lambda data, n: n == 6 and data[:1] == b"\x02", lambda e=emulated: reset(e))  # type: ignore[misc]
         else:
-            at_image(emulated, 1 if when == "floodlight" else 4, emulated.lines["board"].power_cycle)
+            at_image(emulated, 1 if when == "floodlight" else 4, emulated.cables["board"].power_cycle)
         with pytest.raises(DiscoError, match="Remedy"):
             capture(emulated.serial_rig(), PLAN, parts)
         assert emulated.bench.light() == [] and not any(h.on_since for h in emulated.bench.heads)
@@ -59,7 +59,7 @@ def test_everybody_is_told_before_anybody_has_to_confirm() -> None:
     emulated = emulation()
     rig = emulated.serial_rig()
     rig.__enter__()
-    emulated.lines["board"].answer_faults.extend([lambda data: []] * 99)
+    emulated.cables["board"].answer_faults.extend([lambda data: []] * 99)
     begun, off = emulated.clock.now(), []
     for head in emulated.bench.heads:
         assert head.on_since is not None
@@ -99,7 +99,7 @@ def test_no_script_lights_a_laser_that_was_not_armed(make: str, tmp_path: Path) 
     """
     emulated = emulation()
     said: list[bytes] = []
-    for line in emulated.lines.values():
+    for line in emulated.cables.values():
         line.receive = said.append  # type: ignore[method-assign]
     model = emulated.serial_rig()
     if make == "serial":
@@ -176,7 +176,7 @@ def test_light_is_gone_at_once_when_an_image_fails_before_a_silent_board(deaf: b
     emulated = emulation()
     with pytest.raises(DiscoError), emulated.serial_rig() as rig, gate_open(rig.lasers[0]):  # noqa: PT012 - a gate block
         assert emulated.bench.light() == [0]
-        line = emulated.lines["board"]
+        line = emulated.cables["board"]
         line.answer_faults.extend([lambda data: []] * 99)
         if deaf:
             line.command_faults.extend([lambda data: b""] * 99)
@@ -195,17 +195,17 @@ def test_light_is_gone_at_once_when_an_image_fails_before_a_silent_board(deaf: b
 def test_an_answer_lost_in_the_light_puts_it_out_before_anything_is_repeated() -> None:
     emulated, cause = emulation(), "lost an answer while a gate was open"  # and no reset
     with pytest.raises(DeviceFault, match=cause), emulated.serial_rig() as rig, gate_open(rig.lasers[0]):  # noqa: PT012 - a gate block
-        emulated.lines["board"].command_faults.append(lambda data: b"")
+        emulated.cables["board"].command_faults.append(lambda data: b"")
         begun = emulated.clock.now()
         dark = []
-        receive = emulated.lines["laser0"].receive
+        receive = emulated.cables["laser0"].receive
 
         def told(data: bytes) -> None:
             receive(data)
             if b"LOf" in data:
                 dark.append(emulated.clock.now())
 
-        emulated.lines["laser0"].receive = told  # type: ignore[method-assign]
+        emulated.cables["laser0"].receive = told  # type: ignore[method-assign]
         rig.photodiode.read()
     assert dark[0] - begun < 0.3  # the 0.2 s after which an answer counts as lost, and no repetition
 
@@ -215,7 +215,7 @@ def test_an_opening_whose_answer_was_lost_is_not_repeated_before_aiming_anew() -
     sent: list[bytes] = []
     with emulated.serial_rig() as rig:
         rig.projector.move(100, 200)
-        line = emulated.lines["board"]
+        line = emulated.cables["board"]
         receive = line.receive
 
         def received(data: bytes) -> None:
@@ -361,4 +361,4 @@ def test_what_interrupts_one_step_though_signals_wait_leaves_no_other_device_ope
     with pytest.raises(SystemExit):
         rig.make_safe()
     assert emulated.bench.board.lines == 0 and not any(head.on_since for head in emulated.bench.heads)
-    assert not rig.connected and not any(line._users for line in emulated.lines.values())
+    assert not rig.connected and not any(line._users for line in emulated.cables.values())

@@ -35,7 +35,7 @@ def test_the_gate_is_shut_before_a_laser_that_falls_silent_is_told_to_go_off(
     def fall_silent(head: OmicronLaser) -> None:
         lines.append(emulated.bench.board.lines & GATE)
         with monkeypatch.context() as silent:  # it is back when the driver has given it up, for the guard
-            silent.setattr(emulated.lines["laser0"].firmware, "feed", lambda data, now: [])
+            silent.setattr(emulated.cables["laser0"].firmware, "feed", lambda data, now: [])
             stop(head)
 
     monkeypatch.setattr(OmicronLaser, "stop_emission", fall_silent)

@@ -30,7 +30,7 @@ def test_all_cables_pulled_is_a_line_a_device_and_the_error(tmp_path: Path, monk
     (tmp_path / "ports").mkdir()
     (tmp_path / "scene.toml").write_text(SCENE)
     pulled: list[str] = []
-    with Server(emulated.lines, tmp_path / "ports") as server:
+    with Server(emulated.cables, tmp_path / "ports") as server:
         (tmp_path / "rig.toml").write_text(rig_file_of(ONE, server.urls))
         scene, out_folder, rig = (str(tmp_path / name) for name in ("scene.toml", "out", "rig.toml"))
         words = ["capture", scene, "--out", out_folder, "--rig", rig, "--arm"]
@@ -45,7 +45,7 @@ def test_all_cables_pulled_is_a_line_a_device_and_the_error(tmp_path: Path, monk
             process.wait(timeout=40)
         finally:
             process.kill()
-            for name in emulated.lines:
+            for name in emulated.cables:
                 server.plug(name)  # the guards find their lasers again, and end
             end = time.monotonic() + 10.0
             while any(guards_of(port=url) for url in server.urls.values()) and time.monotonic() < end:

@@ -13,19 +13,19 @@ from collections.abc import Callable
 
 import pytest
 import serial
-from guard_fakes import LIMIT_S, Laser, Run, guards_of, said_by, wait
+from guard_fakes import LIMIT_S, Laser, Opening, Run, guards_of, said_by, wait
 
 from hw.base.errors import SwitchedOff
 from hw.safety import guard
 from hw.safety.guard import GuardClosed
 from hw.safety.ports import protocol_guard
-from hw.safety.ports.protocol_guard import Serial
+from hw.safety.ports.protocol_guard import GuardedPort
 from hw.serial.link import Link
 
 
 @pytest.mark.timing
 def test_opening_switches_off_before_anything_is_said_and_closing_does_again(
-    lasers: Callable[..., Laser], ports: Callable[[Laser], Serial]
+    lasers: Callable[..., Laser], ports: Opening
 ) -> None:
     laser = lasers(on=True)
     port = ports(laser)
@@ -79,7 +79,7 @@ def test_off_at_the_end_of_the_program(laser: Laser, run: Run, how: str) -> None
     assert begun < laser.went_off < begun + 3 and laser.said.index("LOn") < len(laser.said) - 1
 
 
-def test_it_insists_until_the_laser_confirms(lasers: Callable[..., Laser], ports: Callable[[Laser], Serial]) -> None:
+def test_it_insists_until_the_laser_confirms(lasers: Callable[..., Laser], ports: Opening) -> None:
     laser = lasers(deaf=9)
     port = ports(laser)
     port.write(b"?LOn\r")
@@ -90,9 +90,7 @@ def test_it_insists_until_the_laser_confirms(lasers: Callable[..., Laser], ports
 
 
 @pytest.mark.parametrize("what", ["preheats", "refusals"])
-def test_a_laser_that_preheats_or_refuses_is_not_taken_for_off(
-    laser: Laser, ports: Callable[[Laser], Serial], what: str
-) -> None:
+def test_a_laser_that_preheats_or_refuses_is_not_taken_for_off(laser: Laser, ports: Opening, what: str) -> None:
     port = ports(laser)
     port.write(b"?GAS\r")
     port.read(64)
@@ -172,10 +170,10 @@ def test_a_guard_that_is_told_to_end_switches_off_first(laser: Laser, link: Link
 
 def test_a_port_that_does_not_exist_is_an_error_of_opening() -> None:
     with pytest.raises(serial.SerialException, match="No such file"):
-        Serial("guard:///dev/disco-no-such-port", baudrate=500000, timeout=0.5)
+        GuardedPort("guard:///dev/disco-no-such-port", baudrate=500000, timeout=0.5)
 
 
-def test_a_dead_port_says_so(laser: Laser, ports: Callable[[Laser], Serial]) -> None:
+def test_a_dead_port_says_so(laser: Laser, ports: Opening) -> None:
     port = ports(laser)
     port.trip()
     with pytest.raises(GuardClosed, match="its guard has closed it"):
@@ -200,7 +198,7 @@ def test_a_stop_or_kill_of_the_whole_foreground_group_does_not_reach_the_guard(l
 
 
 def test_guard_and_program_killed_together_leave_it_on_until_the_next_connection(
-    laser: Laser, run: Run, ports: Callable[[Laser], Serial]
+    laser: Laser, run: Run, ports: Opening
 ) -> None:
     """What docs/lab.md says that only hardware covers: so it is, and connecting again ends it."""
     program = run(laser, "wait")
@@ -232,10 +230,10 @@ def test_every_guard_sees_the_signal(lasers: Callable[..., Laser], run: Run) -> 
 THREE = """
 import signal, sys
 from hw.safety.ports import protocol_guard
-from hw.safety.ports.protocol_guard import Serial
+from hw.safety.ports.protocol_guard import GuardedPort
 signal.signal(signal.SIGTERM, lambda *_: sys.exit())
 names = [sys.argv[1], *sys.argv[2].split(",")]
-ports = [Serial("guard://" + name, baudrate=500000, timeout=0.5, write_timeout=1) for name in names]
+ports = [GuardedPort("guard://" + name, baudrate=500000, timeout=0.5, write_timeout=1) for name in names]
 for port in ports:
     port.write(b"?LOn\\r")
 print("on", flush=True)
@@ -244,7 +242,7 @@ sum(range(2 * 10**9))
 
 
 def test_ctrl_c_while_a_guard_starts_leaves_none_counted(
-    laser: Laser, ports: Callable[[Laser], Serial], monkeypatch: pytest.MonkeyPatch
+    laser: Laser, ports: Opening, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A notebook goes on: with one guard too many, the next laser would be switched off by the signal of before."""
     before = protocol_guard._SIGNALS.guards
@@ -253,17 +251,17 @@ def test_ctrl_c_while_a_guard_starts_leaves_none_counted(
         raise KeyboardInterrupt
 
     started = []
-    start = Serial._start
+    start = GuardedPort._start
 
     class Interrupted(socket.socket):
         recv = interrupted  # type: ignore[assignment]
 
-    def spied(self: Serial) -> socket.socket:
+    def spied(self: GuardedPort) -> socket.socket:
         ours = start(self)
         started.append(self._guard)
         return Interrupted(fileno=ours.detach())
 
-    monkeypatch.setattr(Serial, "_start", spied)
+    monkeypatch.setattr(GuardedPort, "_start", spied)
     with pytest.raises(KeyboardInterrupt):
         ports(laser)
     assert protocol_guard._SIGNALS.guards == before

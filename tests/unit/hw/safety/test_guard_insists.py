@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pytest
 import serial
-from guard_fakes import LIMIT_S, Laser, guards_of, wait
+from guard_fakes import LIMIT_S, Laser, Opening, guards_of, wait
 
 from hw.base.clock import WallClock
 from hw.base.errors import SwitchedOff
 from hw.safety import guard
-from hw.safety.ports.protocol_guard import Serial
+from hw.safety.ports.protocol_guard import GuardedPort
 from hw.serial.link import Link
 
 
@@ -92,7 +92,7 @@ def test_a_cable_that_comes_back_within_ten_minutes_brings_the_switching_off(
     assert done == [True]
 
 
-def test_a_port_that_its_last_guard_still_holds_is_waited_for(laser: Laser, ports: Callable[[Laser], Serial]) -> None:
+def test_a_port_that_its_last_guard_still_holds_is_waited_for(laser: Laser, ports: Opening) -> None:
     held = serial.Serial(laser.port, exclusive=True)
     until = threading.Timer(0.5, held.close)
     until.start()
@@ -102,9 +102,7 @@ def test_a_port_that_its_last_guard_still_holds_is_waited_for(laser: Laser, port
         serial.Serial(laser.port, exclusive=True)  # and nobody else has it meanwhile
 
 
-def test_what_the_laser_says_reaches_a_program_that_reads_slowly(
-    laser: Laser, ports: Callable[[Laser], Serial]
-) -> None:
+def test_what_the_laser_says_reaches_a_program_that_reads_slowly(laser: Laser, ports: Opening) -> None:
     """More than a socket holds: the guard keeps what the program has not taken, and goes on looking after it."""
     port = ports(laser)
     flood = threading.Thread(target=lambda: [os.write(laser.master, b"%07d\n" % k) for k in range(60_000)])
@@ -137,7 +135,7 @@ def test_the_state_of_a_process_is_read_whatever_it_is_called(
     assert guard.stopped(7) is is_stopped
 
 
-def test_signals_of_before_concern_no_laser_that_is_opened_now(laser: Laser, ports: Callable[[Laser], Serial]) -> None:
+def test_signals_of_before_concern_no_laser_that_is_opened_now(laser: Laser, ports: Opening) -> None:
     """A program that obeyed Ctrl-C and goes on may open its lasers again."""
     first = ports(laser)
     with suppress(KeyboardInterrupt):
@@ -152,9 +150,7 @@ def test_signals_of_before_concern_no_laser_that_is_opened_now(laser: Laser, por
     assert laser.on and port.gone() is None
 
 
-def test_forgetting_what_has_arrived_and_a_program_that_ends_an_open_port(
-    laser: Laser, ports: Callable[[Laser], Serial]
-) -> None:
+def test_forgetting_what_has_arrived_and_a_program_that_ends_an_open_port(laser: Laser, ports: Opening) -> None:
     port = ports(laser)
     port.write(b"?GAS\r")
     end = time.monotonic() + 2.0
@@ -167,9 +163,7 @@ def test_forgetting_what_has_arrived_and_a_program_that_ends_an_open_port(
     assert port.gone() == "it is closed" and guards_of(port=laser.port) == []  # the guard has ended when this returns
 
 
-def test_a_command_that_was_cut_short_does_not_spoil_the_switching_off(
-    laser: Laser, ports: Callable[[Laser], Serial]
-) -> None:
+def test_a_command_that_was_cut_short_does_not_spoil_the_switching_off(laser: Laser, ports: Opening) -> None:
     port = ports(laser)
     port.write(b"?LOn\r")
     wait(laser, on=True)
@@ -192,9 +186,7 @@ def test_a_program_is_told_that_its_laser_has_not_confirmed(lasers: Callable[...
 
 
 @pytest.mark.timing
-def test_closing_is_heard_though_a_child_has_a_copy_of_the_socket(
-    laser: Laser, ports: Callable[[Laser], Serial]
-) -> None:
+def test_closing_is_heard_though_a_child_has_a_copy_of_the_socket(laser: Laser, ports: Opening) -> None:
     port = ports(laser)
     port.write(b"?LOn\r")
     wait(laser, on=True)
@@ -207,7 +199,7 @@ def test_closing_is_heard_though_a_child_has_a_copy_of_the_socket(
         os.close(copy)
 
 
-def test_closing_a_port_whose_guard_was_killed_switches_off(laser: Laser, ports: Callable[[Laser], Serial]) -> None:
+def test_closing_a_port_whose_guard_was_killed_switches_off(laser: Laser, ports: Opening) -> None:
     """Though nobody had asked after the guard before."""
     port = ports(laser)
     port.write(b"?LOn\r")
@@ -225,7 +217,7 @@ def test_closing_a_port_whose_guard_was_killed_switches_off(laser: Laser, ports:
 def test_a_link_whose_guard_has_switched_off_says_that_and_not_that_a_cable_is_out(link: Link) -> None:
     """The rig takes the first for granted when it is made safe, and reports the second."""
     port = link._port
-    assert isinstance(port, Serial)
+    assert isinstance(port, GuardedPort)
     port.trip()
     with pytest.raises(SwitchedOff, match="the port of laser 635 nm"):
         link.write(b"?GAS\r")
