@@ -24,6 +24,7 @@ REGISTRY = {
     "irradiance": "benchmarks.irradiance",
     "laser-safety": "benchmarks.laser_safety",
     "pareto": "benchmarks.pareto",
+    "regression": "benchmarks.regression",
     "resample": "benchmarks.resample",
     "stream": "benchmarks.stream",
     "walk": "benchmarks.walk",

@@ -90,14 +90,14 @@ def _photometric(own: Calibration, true: Calibration) -> Calibration:
 def _pose(own: Calibration, true: Calibration) -> Calibration:
     pairs = zip(own.views, true.views, strict=True)
     views = tuple(t.model_copy(update={"radiance_factor": v.radiance_factor}) for v, t in pairs)
-    return own.model_copy(update={"views": views, "projectors": _seen_from(own.projectors, _frames(true, own))})
+    return own.model_copy(update={"views": views, "projectors": _seen_from(own.projectors, object_frames(true, own))})
 
 
 def _projector(own: Calibration, true: Calibration) -> Calibration:
-    return own.model_copy(update={"projectors": _seen_from(true.projectors, _frames(own, true))})
+    return own.model_copy(update={"projectors": _seen_from(true.projectors, object_frames(own, true))})
 
 
-def _frames(here: Calibration, there: Calibration) -> list[NDArray[np.float64]]:
+def object_frames(here: Calibration, there: Calibration) -> list[NDArray[np.float64]]:
     """Per turntable angle, (4, 4) one calibration's object frame -> another's: a rotation, the mean of the views."""
     frames = []
     for j in range(here.n_angles):

@@ -104,7 +104,7 @@ class DecadeScore:
 
     decade:      0 for (peak/10, peak], -1 for the next, ...
     log10_rmse:  root mean square of log10(estimate / truth) over the covered entries, the truth's own noise removed
-                 (signed root); None where no entry is covered
+                 (signed root); log10_bias: the mean; None where no entry is covered
     floor:       the root mean square that the truth's noise had added
     coverage:    share of the decade's entries that the estimate covers
     entries:     number of entries of the decade
@@ -112,6 +112,7 @@ class DecadeScore:
 
     decade: int
     log10_rmse: float | None
+    log10_bias: float | None
     floor: float
     coverage: float
     entries: int
@@ -133,7 +134,7 @@ def score_reflectance(
     peak = np.where(usable, t, 0.0).max(axis=tuple(range(1, t.ndim)), keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         below = np.where(usable, np.log10(peak / t), np.inf)
-        error2 = np.where(e > 0, np.log10(e / t), 1.0) ** 2
+        off = np.where(e > 0, np.log10(e / t), -1.0)
         noise2 = (se / (t * math.log(10))) ** 2
     scores = []
     for decade in range(decades):
@@ -144,7 +145,8 @@ def score_reflectance(
         scores.append(
             DecadeScore(
                 decade=-decade,
-                log10_rmse=signed_root(float(error2[chosen].mean()) - removed) if count else None,
+                log10_rmse=signed_root(float((off[chosen] ** 2).mean()) - removed) if count else None,
+                log10_bias=float(off[chosen].mean()) if count else None,
                 floor=math.sqrt(removed),
                 coverage=count / entries if entries else 0.0,
                 entries=entries,

@@ -1,0 +1,341 @@
+"""What the quick scene's figures are, stage by stage, how far they may move, and proof that the limits catch a slip.
+
+    python -m benchmarks regression --json tests/regression/figures.json
+
+The simulated capture is reproducible, so on the same capture a figure moves only where the pipeline does: its limit is
+the committed figure and a tolerance far below a tenth of it, but above what other linear algebra kernels and numbers of
+threads do (measured here). A change of the simulation, or a processor on which photons round to other paths, makes
+another capture: then the limit is a bound from the spread of the figures over fresh captures, each of another seed and
+so of another rig, another scan and other noise. `caught_from` is the growth of an error that this wider bound catches.
+
+Shown beside them: `power`, the share of perturbations caught, each of which makes one figure of a stage a tenth worse;
+`false_alarm_rate`, the share of runs refused that are as good as the committed one: repetitions with other kernels, and
+fresh captures judged by the bound from the other ones.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.random import Generator
+from rich.console import Console
+from scipy.ndimage import gaussian_filter
+from scipy.optimize import brentq
+from scipy.stats import t as student
+
+from disco_twin.evaluate.budget import VariantFolder
+from disco_twin.evaluate.stage_figures import (
+    FIGURES,
+    StageOutputs,
+    TrueRun,
+    all_figures,
+    load_outputs,
+    load_true_run,
+)
+from disco_twin.experiment.pipeline_process import reconstruct_apart
+from disco_twin.experiment.run_folder import RunFolder
+from disco_twin.faults.actual_rig import nudge
+from disco_twin.light.truth import Truth
+from disco_twin.run.stages import Run, begin_run, capture_stages, pipeline_stage, truth_stages
+from pipeline.calibrate.calibration import Calibration, pose_rows
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+SCENE = REPOSITORY / "scenes" / "quick.toml"
+RUNS = REPOSITORY / "out" / "regression"  # kept: a changed pipeline finds its captures here
+METHOD = "default"
+FRESH = 10
+WORSE = 1.10
+LARGEST = (0.01, 0.1, 1.0, 10.0)  # sizes of perturbations that are tried
+TOLERANCE = 0.01  # of a figure, at least; a tenth worse has to stay far outside
+FALSE_ALARMS = 0.01  # of fresh captures, over all figures together
+KERNELS = ("Prescott", "Haswell", "SkylakeX")  # OpenBLAS: without FMA, with AVX2, with AVX-512
+
+
+@dataclass(frozen=True)
+class Limit:
+    """frozen: a figure on the committed capture; tolerance: how much worse it may be there; bound: on any capture.
+
+    moved: the most that other linear algebra kernels moved it; caught_from: error, over the frozen one, that the bound
+    catches.
+    """
+
+    frozen: float
+    moved: float
+    tolerance: float
+    bound: float
+    caught_from: float
+
+    def allowed(self, same_capture: bool) -> float:
+        """The largest error that passes."""
+        return abs(self.frozen) + self.tolerance if same_capture else self.bound
+
+
+def too_large(figures: Mapping[str, float], limits: Mapping[str, Limit], same_capture: bool) -> dict[str, str]:
+    """The figures whose errors are beyond their limits, each with both numbers; what is no number is beyond."""
+    return {
+        name: f"{value:+.5g} (allowed {limits[name].allowed(same_capture):.5g}, committed {limits[name].frozen:+.5g})"
+        for name, value in figures.items()
+        if not abs(value) <= limits[name].allowed(same_capture)
+    }
+
+
+def bounds(samples: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """By figure, what one more capture exceeds with a probability of `FALSE_ALARMS` over all figures (Student's t)."""
+    n, names = len(samples), list(samples[0])
+    reach = float(student.ppf(1 - FALSE_ALARMS / len(names), n - 1)) * np.sqrt(1 + 1 / n)
+    values = {name: np.array([s[name] for s in samples]) for name in names}
+    return {k: abs(float(v.mean())) + reach * float(v.std(ddof=1)) for k, v in values.items()}
+
+
+def fingerprint(folder: RunFolder) -> str:
+    """Of the images, the scan and the true R_d: equal where the same photons were simulated."""
+    digest = hashlib.blake2b(Truth.load(folder.twin / "truth.npz").mean.tobytes(), digest_size=16)
+    for path in (*sorted(folder.capture.glob("**/images.bin")), folder.capture / "scan.ply"):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+# Perturbations ------------------------------------------------------------------------------------------------------
+
+Perturbation = Callable[[StageOutputs, float, Generator], StageOutputs]
+
+
+def _shaken_views(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
+    own = outputs.calibration
+    moved = [_posed(v, nudge(rng, size, 2 * size) @ np.array(v.object_to_camera)) for v in own.views]
+    return replace(outputs, calibration=own.model_copy(update={"views": tuple(moved)}))
+
+
+def _turned_frames(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
+    own = outputs.calibration
+    turns = [nudge(rng, 0.0, size) for _ in range(own.n_angles)]
+    moved = [_posed(v, np.array(v.object_to_camera) @ turns[i % own.n_angles]) for i, v in enumerate(own.views)]
+    return replace(outputs, calibration=own.model_copy(update={"views": tuple(moved)}))
+
+
+def _posed(view: Any, pose: Any) -> Any:
+    return view.model_copy(update={"object_to_camera": pose_rows(pose)})
+
+
+def _shifted_projector(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
+    own, motion = outputs.calibration, nudge(rng, size, size / 10)
+    moved = [
+        p.model_copy(update={"object_to_projector": pose_rows(motion @ np.array(p.object_to_projector))})
+        for p in own.projectors
+    ]
+    calibration: Calibration = own.model_copy(update={"projectors": tuple(moved)})
+    return replace(outputs, calibration=calibration)
+
+
+def _scattered_spots(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
+    position = outputs.spots.position
+    return replace(
+        outputs, spots=replace(outputs.spots, position=position + size * rng.standard_normal(position.shape))
+    )
+
+
+def _moved_spots(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
+    return replace(
+        outputs, spots=replace(outputs.spots, position=outputs.spots.position + size * rng.standard_normal(3))
+    )
+
+
+def _noisy_samples(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
+    return replace(outputs, values=outputs.values * np.exp(size * rng.standard_normal(outputs.values.shape)))
+
+
+def _scaled_samples(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
+    return replace(outputs, values=outputs.values * np.exp(_sign(rng) * size))
+
+
+def _noisy_entries(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
+    entries = outputs.reflectance
+    return replace(outputs, reflectance=entries * np.exp(size * rng.standard_normal(entries.shape)))
+
+
+def _scaled_entries(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
+    return replace(outputs, reflectance=outputs.reflectance * np.exp(_sign(rng) * size))
+
+
+def _noisy_images(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
+    return _with_images(outputs, lambda image: image * np.exp(size * rng.standard_normal(image.shape)))
+
+
+def _scaled_images(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
+    factor = np.exp(_sign(rng) * size)
+    return _with_images(outputs, lambda image: image * factor)
+
+
+def _blurred_images(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
+    return _with_images(outputs, lambda image: gaussian_filter(image, (0, 10 * size, 10 * size)))
+
+
+def _with_images(outputs: StageOutputs, change: Callable[[Any], Any]) -> StageOutputs:
+    return replace(outputs, images={key: change(image) for key, image in outputs.images.items()})
+
+
+def _sign(rng: Generator) -> int:
+    return int(rng.choice([-1, 1]))
+
+
+PERTURBATIONS: dict[str, tuple[Perturbation, ...]] = {
+    "pose": (_shaken_views, _turned_frames),
+    "projector": (_shifted_projector,),
+    "spots": (_scattered_spots, _moved_spots),
+    "samples": (_noisy_samples, _scaled_samples),
+    "completion": (_noisy_entries, _scaled_entries),
+    "relit": (_noisy_images, _scaled_images, _blurred_images),
+}
+
+
+def stage_outputs(outputs: StageOutputs) -> Iterator[tuple[str, StageOutputs]]:
+    """(stage, outputs) for each stage; relit images one by one, so that each is perturbed alone."""
+    for stage in FIGURES:
+        if stage != "relit":
+            yield stage, outputs
+    for key, image in outputs.images.items():
+        yield "relit", replace(outputs, images={key: image})
+
+
+def made_worse(
+    stage: str, outputs: StageOutputs, true: TrueRun, perturbation: Perturbation, name: str, seed: int
+) -> StageOutputs | None:
+    """The outputs perturbed until the error `name` is `WORSE` times what it was; None where it never is."""
+    before = abs(FIGURES[stage](outputs, true)[name])
+
+    def perturbed(size: float) -> StageOutputs:
+        return perturbation(outputs, size, np.random.default_rng(seed))
+
+    def growth(size: float) -> float:
+        return abs(FIGURES[stage](perturbed(size), true)[name]) / before - WORSE
+
+    largest = next((size for size in LARGEST if growth(size) > 0), None)
+    return None if largest is None else perturbed(brentq(growth, 0.0, largest, xtol=1e-6, rtol=1e-4))
+
+
+def power(
+    outputs: StageOutputs, true: TrueRun, limits: Mapping[str, Limit], repetitions: int
+) -> tuple[dict[str, float], int]:
+    """By stage, the share of perturbations that are caught on the same capture; and how many there were."""
+    caught: dict[str, list[bool]] = {stage: [] for stage in FIGURES}
+    for stage, own in stage_outputs(outputs):
+        for name in FIGURES[stage](own, true):
+            for perturbation in PERTURBATIONS[stage]:
+                for seed in range(repetitions):
+                    worse = made_worse(stage, own, true, perturbation, name, seed)
+                    if worse is not None:
+                        caught[stage].append(bool(too_large(FIGURES[stage](worse, true), limits, True)))
+    return {stage: float(np.mean(c)) for stage, c in caught.items()}, sum(len(c) for c in caught.values())
+
+
+# The command ---------------------------------------------------------------------------------------------------------
+
+
+def take_run(seed: int, quick: bool) -> Run:
+    """A whole run but for its scores, in a folder that is kept; what is finished there is not done again."""
+    folder = RUNS / f"{'small' if quick else 'full'}-{seed}"
+    RUNS.mkdir(parents=True, exist_ok=True)
+    scene = RUNS / f"seed-{seed}.toml"
+    text = SCENE.read_text()
+    assert text.count("\nseed = 1\n") == 1
+    scene.write_text(text.replace("\nseed = 1\n", f"\nseed = {seed}\n"))
+    run = begin_run(scene, folder, "small" if quick else "full", METHOD, Console(quiet=True))
+    run = replace(run, methods=(METHOD,), scene_file=SCENE)  # without the baselines; beside the committed references
+    capture_stages(run)
+    truth_stages(run)
+    pipeline_stage(run)
+    return run
+
+
+def figures_of(run: Run, folder: RunFolder | None = None) -> dict[str, float]:
+    """All figures of a run, or of another pipeline's work on it in `folder`."""
+    true = load_true_run(run.experiment, run.folder)
+    return all_figures(load_outputs(run.experiment, folder or run.folder, true), true)
+
+
+def repeated(run: Run) -> list[dict[str, float]]:
+    """The pipeline again on the same capture, with each of other linear algebra kernels and one thread."""
+    out = []
+    for kernel in KERNELS:
+        variant = VariantFolder(run.folder.root / f"kernel-{kernel}", base=run.folder)
+        variant.work.mkdir(parents=True, exist_ok=True)
+        with _environment(OPENBLAS_CORETYPE=kernel, OMP_NUM_THREADS="1"):
+            reconstruct_apart(run.scene, variant, run.methods)
+        out.append(figures_of(run, variant))
+    return out
+
+
+@contextmanager
+def _environment(**values: str) -> Iterator[None]:
+    before = {key: os.environ.get(key) for key in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for key, value in before.items():
+            os.environ.pop(key) if value is None else os.environ.update({key: value})
+
+
+def make_limits(
+    frozen: Mapping[str, float], repetitions: Sequence[Mapping[str, float]], fresh: Sequence[Mapping[str, float]]
+) -> dict[str, Limit]:
+    """A limit for every figure.
+
+    Raises: ValueError where kernels move a figure by so much that a tenth would not stand out.
+    """
+    bound, limits = bounds(fresh), {}
+    for name, value in frozen.items():
+        moved = max((abs(r[name] - value) for r in repetitions), default=0.0)
+        tolerance = max(TOLERANCE * abs(value), 10 * moved)
+        if tolerance > 0.5 * (WORSE - 1) * abs(value):
+            raise ValueError(f"{name}: {value:.4g} moves by {moved:.1g} with the linear algebra's kernels")
+        limits[name] = Limit(value, moved, tolerance, bound[name], bound[name] / abs(value))
+    return limits
+
+
+def false_alarms(
+    repetitions: Sequence[Mapping[str, float]], fresh: Sequence[Mapping[str, float]], limits: Mapping[str, Limit]
+) -> list[bool]:
+    """Which of the runs that are as good as the committed one are refused; each fresh one by the others' bound."""
+    refused = [bool(too_large(figures, limits, True)) for figures in repetitions]
+    for i, figures in enumerate(fresh):
+        others = bounds([*fresh[:i], *fresh[i + 1 :]])
+        judged = {name: replace(limit, bound=others[name]) for name, limit in limits.items()}
+        refused.append(bool(too_large(figures, judged, False)))
+    return refused
+
+
+def report(
+    frozen: tuple[StageOutputs, TrueRun], key: str, repetitions: Sequence[Mapping[str, float]],
+    fresh: Sequence[Mapping[str, float]], tries: int,
+) -> dict[str, Any]:  # fmt: skip
+    """The record that the tests read."""
+    limits = make_limits(all_figures(*frozen), repetitions, fresh)
+    caught, perturbations = power(*frozen, limits, tries)
+    refused = false_alarms(repetitions, fresh, limits)
+    return {
+        "command": "python -m benchmarks regression --json tests/regression/figures.json",
+        "fingerprint": key,
+        "fresh_captures": len(fresh),
+        "repetitions": perturbations,
+        "power": caught,
+        "false_alarm_rate": float(np.mean(refused)),
+        "figures": {name: asdict(limit) for name, limit in limits.items()},
+        "fresh": [dict(figures) for figures in fresh],
+    }
+
+
+def run(quick: bool = False) -> dict[str, Any]:
+    """{fingerprint, repetitions, power by stage, false_alarm_rate, figures: {name: `Limit`}, fresh: their figures}."""
+    first = take_run(1, quick)
+    true = load_true_run(first.experiment, first.folder)
+    frozen = load_outputs(first.experiment, first.folder, true), true
+    fresh = [figures_of(take_run(seed, quick)) for seed in range(2, 2 + (2 if quick else FRESH))]
+    return report(frozen, fingerprint(first.folder), [] if quick else repeated(first), fresh, 1 if quick else 5)
