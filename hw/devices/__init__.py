@@ -1,1 +1,1 @@
-"""Drivers of real devices: each knows one protocol, refuses every other device, and speaks of the rig in its errors."""
+"""Drivers of real devices: each speaks one protocol, refuses every other device, and names the remedy in its errors."""

@@ -1,1 +1,1 @@
-"""The line to a serial device: opening, framing, waiting, and the log of every byte."""
+"""Links to serial devices: opening, framing, waiting, and the log of every byte."""
