@@ -65,7 +65,7 @@ def collect(experiment: Experiment, folder: RunFolder, summary: dict[str, Any]) 
 def notes(experiment: Experiment) -> list[str]:
     """What a reader must know before believing the figures."""
     if experiment.scene.rig.faults.deviation:
-        return ["The actual rig deviates from the nominal one; the pipeline is told the nominal one only."]
+        return ["The actual rig deviates from the nominal one; the pipeline is given the nominal one only."]
     return [
         "The rig's deviation is off: poses and projector are exactly the nominal ones, as a perfect calibration "
         "would find them."
