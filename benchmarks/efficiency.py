@@ -270,7 +270,7 @@ def images(name: str, obj: Any, quick: bool) -> tuple[F64, list[Job]]:
     """A spot's image, at one pixel a vertex's footprint, by every estimator; volpath on `quick` alone."""
     from disco_twin.light.importance import Splitting
     from disco_twin.light.sources import BeamSource
-    from disco_twin.light.transport import Lobe, Transport
+    from disco_twin.light.transport import CameraLobe, Transport
     from disco_twin.object.build import Medium, TwinObject
     from pipeline.geometry.camera import PinholeCamera, look_at
 
@@ -284,7 +284,7 @@ def images(name: str, obj: Any, quick: bool) -> tuple[F64, list[Job]]:
     axis = -origin / np.linalg.norm(origin)
     tags = np.tile(origin, (REPLICATES, 1)), np.tile(axis, (REPLICATES, 1))
     entries = np.tile(-axis * 17.0 * size, (REPLICATES, 1))
-    transports = {"exits": Transport(obj, lobe=Lobe(100.0, 0.0, 0.0), local=False), "lobes": Transport(obj)}
+    transports = {"exits": Transport(obj, lobe=CameraLobe(100.0, 0.0, 0.0), local=False), "lobes": Transport(obj)}
 
     def run(name: str, effort: float | None) -> Callable[[int, int], F64]:
         split = None if effort is None else Splitting(entries, effort)

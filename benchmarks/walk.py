@@ -78,12 +78,12 @@ def walk_jobs(obj: Any, walks: int) -> dict[str, tuple[int, Callable[[int], Any]
     """The walk with one camera connected at the exits, with Russian roulette and without."""
     from disco_twin.light import splitting
     from disco_twin.light.sources import BeamSource
-    from disco_twin.light.transport import Lobe, Transport
+    from disco_twin.light.transport import CameraLobe, Transport
     from pipeline.geometry.camera import PinholeCamera, look_at
 
     pose = look_at((30.0, 0.0, 400.0), (0.0, 0.0, 0.0))
     camera = PinholeCamera(64, 64, np.full(2, 600.0), np.full(2, 32.0), np.zeros(5), pose)
-    transport = Transport(obj, lobe=replace(Lobe.of(obj.medium, 0.3), reach=0.0))
+    transport = Transport(obj, lobe=replace(CameraLobe.of(obj.medium, 0.3), reach=0.0))
 
     def source(_: Any) -> BeamSource:
         return BeamSource(np.array([[0.1, 0.07, 100.0]]), np.array([[0.0, 0.0, -1.0]]), 1e-3, np.ones((1, 1)))

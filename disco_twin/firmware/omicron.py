@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from disco_twin.firmware.wire import Commands, Timed
+from disco_twin.firmware.wire import LineFirmware, Timed
 from hw.devices.omicron_protocol import LEVELS, USB_BAUD, Mode, Status
 
 LATENCY_S = 0.015
@@ -111,31 +111,24 @@ class LaserHead:
         )
 
 
-class OmicronFirmware:
+class OmicronFirmware(LineFirmware):
     """The parser: `?` letters arguments CR. Silent while it restarts."""
 
     def __init__(self, head: LaserHead, baud: int = USB_BAUD) -> None:
+        super().__init__(b"\r")
         self.head, self.baud = head, baud
-        self._commands = Commands(b"\r")
         self._separator = "\xa7"
-
-    def opened(self, now: float) -> None:
-        """Opening the port changes nothing: a laser that emits goes on."""
-        self._commands.clear()
 
     def power_cycle(self, now: float) -> None:
         """Settings from memory; the separator is the factory's again."""
-        self._commands.clear()
+        super().power_cycle(now)
         self._separator = "\xa7"
         self.head.start(now)
 
-    def feed(self, data: bytes, now: float) -> list[Timed]:
-        """Answer every command that ends in these bytes."""
-        answers: list[Timed] = []
-        for line in self._commands.complete(data):
-            if line.startswith("?") and now >= self.head.restarted_until:
-                answers += self._answer(line[1:4], line[4:], now)
-        return answers
+    def answers(self, command: str, now: float) -> list[Timed]:
+        """None while it restarts."""
+        heard = command.startswith("?") and now >= self.head.restarted_until
+        return self._answer(command[1:4], command[4:], now) if heard else []
 
     def _answer(self, letters: str, arguments: str, now: float) -> list[Timed]:
         if letters == "RsC":

@@ -4,36 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from disco_twin.firmware.wire import Commands, Timed
+from disco_twin.firmware.wire import LineFirmware, Timed
 
 BAUD = 9600
 LATENCY_S = 0.02
 
 
-class OphirFirmware:
-    """`watts()` is the light on the sensor; above `range_w` the meter says OVER."""
+class OphirFirmware(LineFirmware):
+    """`watts()` is the light on the sensor; above `range_w` the meter answers OVER."""
 
     baud = BAUD
 
     def __init__(self, watts: Callable[[], float], range_w: float = 0.03, model: str = "Vega") -> None:
+        super().__init__(b"\r\n")
         self.watts, self.range_w, self.model = watts, range_w, model
-        self._commands = Commands(b"\r\n")
 
-    def opened(self, now: float) -> None:
-        """Opening the port changes nothing."""
-        self._commands.clear()
-
-    def power_cycle(self, now: float) -> None:
-        """The meter starts as it was."""
-        self._commands.clear()
-
-    def feed(self, data: bytes, now: float) -> list[Timed]:
-        """Answer every command that ends in these bytes."""
-        answers: list[Timed] = []
-        for line in self._commands.complete(data):
-            if line.startswith("$"):
-                answers.append((LATENCY_S, f"{self._answer(line[1:])}\r\n".encode("ascii")))
-        return answers
+    def answers(self, command: str, now: float) -> list[Timed]:
+        """One line to each command, which starts with $."""
+        return [(LATENCY_S, f"{self._answer(command[1:])}\r\n".encode("ascii"))] if command.startswith("$") else []
 
     def _answer(self, command: str) -> str:
         match command.upper():

@@ -1,4 +1,4 @@
-"""The line between a computer and an emulated device: baud rate, latency, and everything that goes wrong on a cable.
+"""The cable between a computer and an emulated device: baud rate, latency, and what goes wrong on a cable.
 
 A device's firmware is a pure state machine: bytes in, timed bytes out. `Cable` lets its answers arrive when a real line
 would deliver them, and implements `hw.serial.ports.protocol_memory.Peer`, so that drivers reach it as `memory://NAME`.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Protocol
 
 from hw.base.clock import Clock
@@ -36,24 +36,34 @@ class Firmware(Protocol):
         """The mains failed and came back."""
 
 
-class Commands:
-    """Commands out of the bytes that arrive, for devices whose commands end in a byte of `ends`."""
+class LineFirmware:
+    """Firmware whose commands are texts that end in a byte of `ends`; opening the port forgets one that has begun."""
 
     def __init__(self, ends: bytes) -> None:
         self._ends, self._begun = ends, bytearray()
 
-    def clear(self) -> None:
-        """Forget a command that has begun."""
+    def opened(self, now: float) -> None:
+        """The device goes on with what it does."""
         self._begun.clear()
 
-    def complete(self, data: bytes) -> Iterator[str]:
-        """Every command that ends in these bytes, without its end."""
+    def power_cycle(self, now: float) -> None:
+        """As opening."""
+        self.opened(now)
+
+    def feed(self, data: bytes, now: float) -> list[Timed]:
+        """Answer every command that ends in these bytes."""
+        answers: list[Timed] = []
         for byte in data:
             if byte not in self._ends:
                 self._begun.append(byte)
                 continue
             command, self._begun = self._begun.decode("latin-1"), bytearray()
-            yield command
+            answers += self.answers(command, now)
+        return answers
+
+    def answers(self, command: str, now: float) -> list[Timed]:
+        """What the device answers to a command without its end, and when."""
+        raise NotImplementedError
 
 
 # ---- what may become of an answer
@@ -94,7 +104,7 @@ def broken_by(message: bytes, at: int) -> Fault:
     return lambda data: [(0.0, data[:at] + message + data[at:])]
 
 
-# ---- the line
+# ---- the cable
 
 
 class Cable:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from disco_twin.firmware.turning import Spindle
-from disco_twin.firmware.wire import Commands, Timed
+from disco_twin.firmware.wire import LineFirmware, Timed
 from hw.devices.zaber import BAUD, checksum
 
 LATENCY_S = 0.002
@@ -14,7 +14,7 @@ MICROSTEPS_PER_DEG = 768_000 / 360.0  # of an X-RSW60A
 MAX_POSITION = 768_000_000
 
 
-class ZaberFirmware:
+class ZaberFirmware(LineFirmware):
     """One stage with one axis. Messages with a wrong checksum, or for another device, are ignored."""
 
     baud = BAUD
@@ -26,6 +26,7 @@ class ZaberFirmware:
         address: int = 1,
         stage: str = "rotary",
     ) -> None:
+        super().__init__(b"\r\n")
         self.spindle, self.microsteps_per_deg, self.address = spindle, microsteps_per_deg, address
         self.driver_on, self.emergency_stop, self.interrupted = True, False, False
         turn = round(360.0 * microsteps_per_deg) if stage == "rotary" else 0
@@ -48,26 +49,17 @@ class ZaberFirmware:
             "maxspeed": "153600",
         }
         self._volatile = dict(self.settings)
-        self._commands = Commands(b"\r\n")
-
-    def opened(self, now: float) -> None:
-        """Opening the port changes nothing."""
-        self._commands.clear()
 
     def power_cycle(self, now: float) -> None:
         """The reference is lost, settings of the session are the stored ones again."""
-        self._commands.clear()
+        super().power_cycle(now)
         self.settings = dict(self._volatile)
         self.spindle.power_cycle(now)
 
-    def feed(self, data: bytes, now: float) -> list[Timed]:
-        """Answer every command that ends in these bytes."""
-        answers: list[Timed] = []
-        for line in self._commands.complete(data):
-            answer = self._answer(line, now)
-            if answer:
-                answers.append((LATENCY_S, answer))
-        return answers
+    def answers(self, command: str, now: float) -> list[Timed]:
+        """At most one line."""
+        answer = self._answer(command, now)
+        return [(LATENCY_S, answer)] if answer else []
 
     def _answer(self, line: str, now: float) -> bytes:
         start = line.rfind("/")

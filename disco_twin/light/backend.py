@@ -1,4 +1,4 @@
-"""Which LLVM and which Mitsuba variant run: chosen once, before drjit is imported, and said in one line.
+"""Which LLVM and which Mitsuba variant run: chosen once, before drjit is imported, and logged in one line.
 
 Dr.Jit 1.5 emits `llvm.minimum/maximum`. LLVM 14 and 15, which many distributions ship, pass Dr.Jit's own check and
 then abort the whole process in the middle of a render; so the library is chosen here and never left to chance.
@@ -26,6 +26,7 @@ REMEDY = (
     "pip install karellen-llvm-core, or install libllvm19 (Debian) or llvm (Homebrew), "
     f"or point {ENVIRONMENT_KEY} at a libLLVM of version {OLDEST_LLVM} or newer"
 )
+TOO_OLD = f"which aborts Dr.Jit 1.5 in the middle of a render (allowed: {OLDEST_LLVM} or newer). Remedy: {REMEDY}"
 
 
 class BackendError(DiscoError):
@@ -34,7 +35,7 @@ class BackendError(DiscoError):
 
 @dataclass(frozen=True)
 class Library:
-    """An LLVM library: its path and its major version (None: it could not be loaded, or does not say)."""
+    """An LLVM library: its path and its major version (None: it could not be loaded, or is not stated)."""
 
     path: str
     version: int | None
@@ -58,7 +59,7 @@ _active: Backend | None = None
 
 
 def llvm_version(path: str) -> int | None:
-    """Major version by the library's own word (`LLVMGetVersion`, since LLVM 16), else by its name; None: unknown."""
+    """Major version as the library states it (`LLVMGetVersion`, since LLVM 16), else by its name; None: unknown."""
     try:
         library = ctypes.CDLL(path)
     except OSError:
@@ -100,16 +101,16 @@ def _existing(folder: Path, patterns: Iterable[str]) -> list[str]:
 
 
 def choose_llvm(paths: Iterable[str], chosen_by_user: str | None) -> tuple[Library, str]:
-    """The library to use and the reason. A user's own choice is honoured or refused with the reason, never replaced."""
+    """The library to use and the reason. A user's own choice is taken or refused, never replaced.
+
+    Raises: BackendError where no library can be used.
+    """
     if chosen_by_user:
         version = llvm_version(chosen_by_user)
         if version is None:
             raise BackendError(f"{ENVIRONMENT_KEY}={chosen_by_user} is no loadable LLVM library. Remedy: {REMEDY}")
         if version < OLDEST_LLVM:
-            raise BackendError(
-                f"{ENVIRONMENT_KEY}={chosen_by_user} is LLVM {version}, which aborts Dr.Jit 1.5 in the middle of a "
-                f"render (allowed: {OLDEST_LLVM} or newer). Remedy: {REMEDY}"
-            )
+            raise BackendError(f"{ENVIRONMENT_KEY}={chosen_by_user} is LLVM {version}, {TOO_OLD}")
         return Library(chosen_by_user, version), f"chosen by {ENVIRONMENT_KEY}"
     refused: dict[int, str] = {}
     for path in paths:
@@ -121,10 +122,7 @@ def choose_llvm(paths: Iterable[str], chosen_by_user: str | None) -> tuple[Libra
             return Library(path, version), "from this Python environment" if own else "from the system"
         refused.setdefault(version, path)
     if refused:
-        raise BackendError(
-            f"only LLVM {', '.join(map(str, sorted(refused)))} found, which aborts Dr.Jit 1.5 in the middle of a "
-            f"render (allowed: {OLDEST_LLVM} or newer). Remedy: {REMEDY}"
-        )
+        raise BackendError(f"only LLVM {', '.join(map(str, sorted(refused)))} found, {TOO_OLD}")
     raise BackendError(f"no LLVM library found. Remedy: {REMEDY}")
 
 
@@ -141,7 +139,10 @@ def has_cuda_driver() -> bool:
 
 
 def activate() -> Backend:
-    """Choose the backend, set Mitsuba's variant, and say so once. Later calls return the same choice."""
+    """Choose the backend, set Mitsuba's variant, and log both once. Later calls return the same choice.
+
+    Raises: BackendError where there is no usable renderer.
+    """
     global _active
     if _active is not None:
         return _active

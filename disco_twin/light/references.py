@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.base.errors import InputError
+from hw.base.files import require_version
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.relight.lights import Light
 
@@ -47,7 +48,6 @@ def render_reference(
     transport: Transport, light: Light, cameras: Sequence[PinholeCamera], walks: int, seed: int, key: str = ""
 ) -> list[Reference]:
     """Trace one light towards all cameras at once; `walks` is the number of photons in both halves together."""
-
     from disco_twin.light.sources import light_source  # what is stored can be read without a renderer
 
     def source(group: Sequence[int]) -> Source:
@@ -85,7 +85,7 @@ def save_reference(path: Path, reference: Reference) -> None:
 
 
 def load_reference(path: Path) -> Reference:
-    """Read what `save_reference` wrote."""
+    """Read what `save_reference` wrote. Raises: InputError for a missing or damaged file, and for another format."""
     import OpenEXR
 
     if not path.is_file():
@@ -95,17 +95,9 @@ def load_reference(path: Path) -> Reference:
             header, channels = dict(file.header()), {name: c.pixels for name, c in file.channels().items()}
     except (OSError, RuntimeError, ValueError) as error:
         raise InputError("not a readable EXR", file=path, remedy=RENDER_AGAIN) from error
-    if header.get("formatVersion") != FORMAT_VERSION:
-        raise InputError(
-            "another format", file=path, key="formatVersion", value=header.get("formatVersion"),
-            allowed=str(FORMAT_VERSION), remedy=RENDER_AGAIN,
-        )  # fmt: skip
+    require_version(path, header.get("formatVersion"), FORMAT_VERSION, RENDER_AGAIN)
     lasers = len(channels) // (len(HALVES) * len(LAYERS))
-    halves = np.stack(
-        [
-            np.stack([np.stack([channels[f"{layer}.{half}.{k}"] for k in range(lasers)]) for layer in LAYERS])
-            for half in HALVES
-        ]
-    )
+    names = [[[f"{layer}.{half}.{k}" for k in range(lasers)] for layer in LAYERS] for half in HALVES]
+    halves = np.array([[[channels[name] for name in row] for row in rows] for rows in names])
     scale = float(header["radianceScale"])
     return Reference(halves.astype(np.float32) * scale, int(header["walks"]), str(header["key"]))

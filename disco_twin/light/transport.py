@@ -20,7 +20,7 @@ from disco_twin.light.majorants import LocalMajorants, local_majorants
 from disco_twin.light.sources import Source, opaque3, to_float, weight_type
 from disco_twin.light.splitting import Window
 from disco_twin.light.tables import FAR
-from disco_twin.light.walk import Balance, walk
+from disco_twin.light.walk import Tally, walk
 from disco_twin.object.build import Medium, TwinObject
 from pipeline.geometry.camera import PinholeCamera
 
@@ -33,7 +33,7 @@ ACCUMULATOR_BYTES = 256 << 20
 
 
 @dataclass(frozen=True)
-class Lobe:
+class CameraLobe:
     """The lobe connection: its concentration, the depth from which it starts and its longest flight, both in mm."""
 
     kappa: float
@@ -41,7 +41,7 @@ class Lobe:
     length: float
 
     @classmethod
-    def of(cls, medium: Medium, alpha: float) -> Lobe:
+    def of(cls, medium: Medium, alpha: float) -> CameraLobe:
         """Six and twenty mean free paths, the narrower the smoother: docs/decisions/0010."""
         free_path = 1.0 / max(float(medium.sigma_t.mean()), 1e-9)
         return cls(40.0 / max(alpha, 0.02), 6.0 * free_path, 20.0 * free_path)
@@ -68,9 +68,9 @@ class Transport:
     one majorant for the whole object, which costs time; benchmarks and tests compare with it.
     """
 
-    def __init__(self, obj: TwinObject, cells: int = 128, lobe: Lobe | None = None, local: bool = True) -> None:
+    def __init__(self, obj: TwinObject, cells: int = 128, lobe: CameraLobe | None = None, local: bool = True) -> None:
         self.object = obj
-        self.lobe = lobe or Lobe.of(obj.medium, obj.boundary.alpha)
+        self.lobe = lobe or CameraLobe.of(obj.medium, obj.boundary.alpha)
         self.vertices = np.asarray(obj.mesh.vertices, np.float64)
         self.faces = np.asarray(obj.mesh.faces, np.int64)
         self.radius = float(np.linalg.norm(self.vertices, axis=1).max()) * 1.001
@@ -229,12 +229,8 @@ class Transport:
                 return None
             return values[0] if len(values) == 1 else np.take(np.concatenate(values, axis), order, axis)
 
-        balance = EnergyBalance(
-            **{
-                name: np.concatenate([getattr(p.balance, name) for p in parts])[order]
-                for name in EnergyBalance.__dataclass_fields__
-            }
-        )
+        names = EnergyBalance.__dataclass_fields__
+        balance = EnergyBalance(**{k: np.concatenate([getattr(p.balance, k) for p in parts])[order] for k in names})
         balance.warn_of_loss()
         return Traced(join("images", 3), join("variance", 3), join("deposits", 1), balance)
 
@@ -245,18 +241,12 @@ class Transport:
     ) -> Traced:  # fmt: skip
         tables = self._tables(group)
         table = camera_table(cameras) if cameras else None
-        per_tag = (
-            8
-            * len(group)
-            * (
-                (4 * layers * table.count * table.width * table.height if table else 0)
-                + (len(self.vertices) if deposit else 0)
-            )
-        )
+        numbers = 4 * layers * table.count * table.width * table.height if table else 0
+        per_tag = 8 * len(group) * (numbers + deposit * len(self.vertices))
         batch = max(1, min(tags, ACCUMULATOR_BYTES // max(per_tag, 1), (1 << 31) // max(walks, 1)))
         names = mi.UInt32(streams)
         window = self._window(group, split) if split is not None else None
-        total = {name: np.zeros(len(group)) for name in Balance.__dataclass_fields__}
+        total = {name: np.zeros(len(group)) for name in Tally.__dataclass_fields__}
         images, variances, deposits = [], [], []
         for low in range(0, tags, batch):
             n = min(batch, tags - low)
@@ -332,16 +322,12 @@ def new_images(cameras: Sequence[PinholeCamera], layers: int, size: int, weight:
     quantum_squared = 2.0 ** (2 * np.floor(np.log2(unit)) - 24)
     arrays = [dr.zeros(mi.UInt64, size) for _ in range(4)]
     dr.eval(arrays)
-    images = kernel.Images(
+    return kernel.Images(
         layers=layers,
-        exits=arrays[0],
-        exits_squared=arrays[1],
-        lobes=arrays[2],
-        lobes_squared=arrays[3],
+        **dict(zip(("exits", "exits_squared", "lobes", "lobes_squared"), arrays, strict=True)),
         inverse_quantum=dr.opaque(mi.Float, 1 / quantum),
         inverse_quantum_squared=dr.opaque(mi.Float, 1 / quantum_squared),
     )
-    return images
 
 
 def read_images(images: kernel.Images, shape: tuple[int, ...], walks: int) -> tuple[F32, F32]:

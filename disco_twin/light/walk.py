@@ -64,7 +64,7 @@ def deposit(t: Tables, deposits: Any, tag: Any, si: Any, weight: Any, rng: Rng, 
 
 
 @dataclass
-class Balance:
+class Tally:
     """Where the launched power went, per lane and wavelength: sums over the photons that the lane walked."""
 
     launched: Any
@@ -122,7 +122,7 @@ def nobody(weight: Any, lanes: int) -> tuple[Photon, Reservoir]:
 
 
 @dr.syntax
-def collide(t: Tables, photon: Photon, rate: Any, reservoir: Reservoir, sums: Balance, rng: Rng, connects: bool) -> Any:
+def collide(t: Tables, photon: Photon, rate: Any, reservoir: Reservoir, sums: Tally, rng: Rng, connects: bool) -> Any:
     """A possible collision at the photon's place, after a flight under the majorant `rate`: absorb, offer it to the
     reservoir, scatter; or nothing (null).
 
@@ -153,7 +153,7 @@ def collide(t: Tables, photon: Photon, rate: Any, reservoir: Reservoir, sums: Ba
 @dr.syntax
 def cross(
     t: Tables, photon: Photon, si: Any, cams: Cameras | None, images: Images | None, deposits: Deposits | None,
-    sums: Balance, rng: Rng,
+    sums: Tally, rng: Rng,
 ) -> Any:  # fmt: skip
     """The photon meets the surface at si: connects to the cameras, is reflected or refracted, or leaves.
 
@@ -196,7 +196,7 @@ def cross(
 @dr.syntax
 def fly(
     t: Tables, photon: Photon, flight: Any, rate: Any, reservoir: Reservoir, cams: Cameras | None,
-    images: Images | None, deposits: Deposits | None, sums: Balance, rng: Rng,
+    images: Images | None, deposits: Deposits | None, sums: Tally, rng: Rng,
 ) -> Any:  # fmt: skip
     """A flight that may meet the surface: up to it, to the collision at its end, or out of sight.
 
@@ -235,7 +235,7 @@ def walk(
     t: Tables, source: Source, cams: Cameras | None, images: Images | None, deposits: Deposits | None,
     count: Any, per_tag: Any, first: Any, first_tag: Any, streams: Any, seed: Any, inverse_scale: Any,
     window: Window | None, lanes: int,
-) -> Balance:  # fmt: skip
+) -> Tally:  # fmt: skip
     """Walk `count` photons, `per_tag` of each tag, numbers `first`... of their tag's stream; returns the balance.
 
     Tags start at `first_tag` for the source and the streams, at 0 in the accumulators. streams: UInt32 per tag, the
@@ -244,7 +244,7 @@ def walk(
     """
     weight = weight_type(t.lasers)
     wide = dr.float64_array_t(weight)  # sums in double precision: a few lanes may walk most of the photons
-    sums = Balance(*[dr.zeros(wide, lanes) for _ in range(7)])
+    sums = Tally(*[dr.zeros(wide, lanes) for _ in range(7)])
     counter = dr.zeros(mi.UInt32, 1)
     dr.eval(counter)
     rng = Rng(dr.zeros(mi.UInt32, lanes), dr.zeros(mi.UInt32, lanes))

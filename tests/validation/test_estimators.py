@@ -18,7 +18,7 @@ from disco_twin.evaluate.simulation_noise import splat_share
 from disco_twin.light import connect
 from disco_twin.light.connect import project, transmittance
 from disco_twin.light.tables import medium_at
-from disco_twin.light.transport import Lobe, Transport, camera_table
+from disco_twin.light.transport import CameraLobe, Transport, camera_table
 from disco_twin.object.build import Medium
 from pipeline.geometry.camera import PinholeCamera, look_at
 
@@ -38,7 +38,7 @@ def test_lobe_connection_is_unbiased(g: float, alpha: float) -> None:
     images = []
     # The smoother, the rarer and the brighter the exits towards a camera, and the later their sums are normal.
     few, many = (2_000, 12_000) if alpha > 0.1 else (4_000, 80_000)
-    for lobe, walks in ((None, few), (Lobe(100.0, 0.0, 0.0), many)):
+    for lobe, walks in ((None, few), (CameraLobe(100.0, 0.0, 0.0), many)):
         transport = Transport(obj, cells=64, lobe=lobe)
         traced = transport.trace(beam(REPLICATES, **SPOT), REPLICATES, walks, seed=71, cameras=views, layers=2)
         assert traced.images is not None

@@ -18,7 +18,7 @@ from twins import beam, block, camera, escaped, twin
 from disco_twin.light.importance import STEEPEST, Splitting, diffusion, window_targets
 from disco_twin.light.sources import opaque3, to_float
 from disco_twin.light.splitting import Window
-from disco_twin.light.transport import Lobe, Transport
+from disco_twin.light.transport import CameraLobe, Transport
 
 F64 = NDArray[np.float64]
 REPLICATES = 32
@@ -95,7 +95,7 @@ def test_copies_remember_their_last_collision() -> None:
     obj = bumpy(g=0.8)  # lobes and flights often point the same way
     views = [camera(place, 13.0, 24) for place in VIEWS]
     totals = []
-    for lobe, split, walks in ((None, Splitting(ENTRY), 6_000), (Lobe(100.0, 0.0, 0.0), None, 12_000)):
+    for lobe, split, walks in ((None, Splitting(ENTRY), 6_000), (CameraLobe(100.0, 0.0, 0.0), None, 12_000)):
         transport = Transport(obj, cells=64, lobe=lobe)
         random_window(transport, -7.0, 7.0, (-2.0, -0.5))
         traced = transport.trace(beam(REPLICATES, **SPOT), REPLICATES, walks, seed=86, cameras=views, split=split)
