@@ -1,1 +1,19 @@
 """The simulated DISCO rig: objects, light, cameras, ground truth, reports and the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from disco_twin.evaluate.opened_run import OpenedRun
+
+
+def open_run(folder: str | Path) -> OpenedRun:
+    """A run folder's content as arrays with named axes and units; needs no renderer (docs/howto/write-a-method.md).
+
+    Raises: InputError for a folder that is no run, and, from what is asked for, where its stage is not finished.
+    """
+    from disco_twin.evaluate.opened_run import OpenedRun
+
+    return OpenedRun(Path(folder))

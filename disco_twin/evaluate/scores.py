@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -43,7 +44,7 @@ def score_run(experiment: Experiment, folder: RunFolder, methods: Sequence[str])
     scores = {
         "format_version": FORMAT_VERSION,
         "relit": score_relit_images(experiment, folder, methods),
-        "reflectance": score_models(folder, methods),
+        "reflectance": score_reflectances(folder, {m: partial(load_model, folder, m) for m in methods}),
     }
     write_json(scores_file(folder), scores)
 
@@ -60,7 +61,20 @@ def load_scores(folder: RunFolder) -> dict[str, Any]:
 
 
 def score_relit_images(experiment: Experiment, folder: RunFolder, methods: Sequence[str]) -> list[dict[str, Any]]:
-    """Rows {light, view, method, nrmse, nrmse_se, nrmse_floor, psnr, energy_ratio}; what has no score holds None."""
+    """`score_images` of what the pipeline left."""
+    return score_images(experiment, folder, methods, lambda *which: load_relit(folder, *which))
+
+
+def score_images(
+    experiment: Experiment,
+    folder: RunFolder,
+    methods: Sequence[str],
+    image_of: Callable[[str, str, CameraConfig], F32],
+) -> list[dict[str, Any]]:
+    """Rows {light, view, method, nrmse, nrmse_se, nrmse_floor, psnr, energy_ratio}; what has no score holds None.
+
+    image_of: method, light, view -> (L, H, W) relit image in W/(mm^2 sr)
+    """
     from disco_twin.light.references import LAYERS, load_reference
 
     rows = []
@@ -70,7 +84,7 @@ def score_relit_images(experiment: Experiment, folder: RunFolder, methods: Seque
         for view in experiment.scene.relight.views:
             a, b = load_reference(reference_path(folder.twin / "references", light, view)).halves[:, layer]
             for method in methods:
-                image = load_relit(folder, method, light.name, view)
+                image = image_of(method, light.name, view)
                 row = {"light": light.name, "view": view.name, "method": method}
                 rows.append(row | usable_score(" ".join(row.values()), image, a, b, masks[view.name]))
     return rows
@@ -113,8 +127,9 @@ def load_model(folder: RunFolder, method: str) -> RelightableModel:
     return RelightableModel.load(folder.work / f"model-{method}.npz")
 
 
-def score_models(folder: RunFolder, methods: Sequence[str]) -> dict[str, Any]:
-    """By method: log10_rmse of measured and of all entries and the coverage, each by decade below the peak.
+def score_reflectances(folder: RunFolder, models: Mapping[str, Callable[[], RelightableModel]]) -> dict[str, Any]:
+    """By method, given how to get its model: log10_rmse of measured and of all entries, and the coverage, each by
+    decade below the peak.
 
     A method whose R_d cannot be scored has None; one whose model states no R_d is left out.
     """
@@ -123,8 +138,8 @@ def score_models(folder: RunFolder, methods: Sequence[str]) -> dict[str, Any]:
 
     truth = Truth.load(folder.twin / "truth.npz")
     out: dict[str, Any] = {}
-    for method in methods:
-        estimate = load_model(folder, method).reflectance_columns(truth.columns)
+    for method, model in models.items():
+        estimate = model().reflectance_columns(truth.columns)
         if estimate is None:
             continue
         try:

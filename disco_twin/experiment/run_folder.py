@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
+from disco_twin.scene.scene import Scene
 from hw.base.config import Strict, as_table, read_json
 from hw.base.errors import DiscoError, InputError
 from hw.base.files import take_lock, write_atomically, write_json
@@ -62,6 +63,15 @@ class RunFolder:
     @property
     def scene_file(self) -> Path:
         return self.root / "scene.toml"
+
+    @property
+    def scene_record(self) -> Path:
+        """The scene as it was run: its profile applied, its file names absolute."""
+        return self.root / "scene.json"
+
+    def read_scene(self) -> Scene:
+        """Read `scene_record`. Raises: InputError."""
+        return read_json(self.scene_record, Scene, f"disco-twin run SCENE --out {self.root} writes it anew")
 
     @property
     def capture(self) -> Path:

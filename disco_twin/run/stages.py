@@ -18,7 +18,6 @@ from disco_twin.experiment.references import reference_key, render_references, s
 from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.run.progress import Report, run_log, stage_bar
 from disco_twin.scene.scene import Profile, Scene, load_scene
-from hw.base.config import read_json
 from hw.base.errors import InputError, refused_by_the_disk
 from hw.base.files import write_atomically
 from pipeline.capture.loop import Interrupted
@@ -106,14 +105,14 @@ def begin_run(
     scene = load_scene(scene_file, profile, faults)
     chosen = choose_methods(methods, scene)
     folder = RunFolder.claim(out, scene_file, identity(scene))
-    write_atomically(folder.root / SCENE_RECORD, scene.model_dump_json(indent=1).encode())
+    write_atomically(folder.scene_record, scene.model_dump_json(indent=1).encode())
     return Run(Experiment(scene), folder, scene_file, chosen, console)
 
 
 def reopen_run(out: Path, methods: str | None, console: Console) -> Run:
     """An existing run folder, to do a part of it again. Raises: InputError where it is none."""
     folder = RunFolder.open(out)
-    scene = read_json(out / SCENE_RECORD, Scene, f"disco-twin run SCENE --out {out} writes it anew")
+    scene = folder.read_scene()
     return Run(Experiment(scene), folder, folder.scene_file, choose_methods(methods, scene), console)
 
 
