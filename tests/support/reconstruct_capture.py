@@ -73,10 +73,10 @@ def images(calibration: Calibration, plan: Plan, address: ImageAddress) -> np.nd
     return np.asarray(out.reshape(camera.height, camera.width))
 
 
-def write_capture(folder: Path, subdivisions: int = 2) -> trimesh.Trimesh:
+def write_capture(folder: Path, subdivisions: int = 2, scan: trimesh.Trimesh | None = None) -> trimesh.Trimesh:
     """Everything that the pipeline reads; returns the scan."""
     folder.mkdir(parents=True)
-    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS)
+    mesh = scan or trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS)
     config = rig()
     calibration = nominal_calibration(config, SENSOR)
     plan = make_plan(config, mesh)
