@@ -27,7 +27,6 @@ from pipeline.stream.stream import StreamReader
 
 log = logging.getLogger(__name__)
 
-SCENE_RECORD = "scene.json"  # the scene as it was run: profile applied, file names absolute
 CODE = {  # where the code of a stage begins: all that it imports is part of the stage's key
     "scan": ("disco_twin.run.scan",),
     "targets": ("disco_twin.run.targets",),

@@ -94,6 +94,9 @@ def test_the_closure_holds_what_is_imported_in_functions_and_the_packages_on_the
     assert {"disco_twin.light.transport", "pipeline.plan.plan", "disco_twin.light", "hw"} <= {*found}
     assert "disco_twin.scene.scene" not in found  # for type checking alone
     assert {"pipeline.reconstruct.baselines.dipole"} <= {*import_closure("pipeline.reconstruct")}
+    light = " ".join(import_closure("disco_twin.light", "disco_twin.scene.scene"))
+    assert "evaluate" not in light  # what `disco_twin.open_run` imports is no part of the simulated light
+    assert "pipeline.model" not in light
 
 
 def test_scores_of_other_methods_are_other_scores(folder: RunFolder) -> None:
