@@ -1,4 +1,4 @@
-"""The rig as an interface: what the capture loop knows of lasers, projector, turntable, cameras, photodiode.
+"""The rig as an interface: lasers, projector, turntable, cameras and photodiode as the capture loop uses them.
 
 The twin and real devices implement the same protocols. Units: radians, watts, seconds, projector steps.
 """

@@ -1,4 +1,4 @@
-"""The camera's raw record (exposure exponent + charge per pixel) and what it says about radiance.
+"""The camera's raw record (exposure exponent + charge per pixel) and the radiance that follows from it.
 
 This is the Lars III's principle (thesis 4.3): every pixel decides at power-of-two time steps whether it has
 received enough light, and stores the step and the charge. A bracketed GenICam camera fills the same record.

@@ -26,7 +26,7 @@ LONGEST_S = 1e7  # that devices are emulated: 116 days
 
 RigPath = Annotated[Path, typer.Argument(metavar="RIG.TOML", help="The rig file.")]
 SceneOption = Annotated[
-    Path | None, typer.Option("--scene", metavar="SCENE", help="The scene, which knows the cameras' sizes.")
+    Path | None, typer.Option("--scene", metavar="SCENE", help="The scene, which has the cameras' sizes.")
 ]
 ArmOption = Annotated[bool, typer.Option("--arm", help="Let real lasers emit.")]
 LogsOption = Annotated[
@@ -101,7 +101,7 @@ def _show(findings: Generator[DeviceFinding, None, None]) -> None:
                 console.print(str(finding), highlight=False, markup=False, soft_wrap=True)
                 good, count = good and finding.good, count + 1
         except KeyboardInterrupt:
-            raise Interrupted("stopped: gates and lamps were told off, and every laser that was on") from None
+            raise Interrupted("stopped: gates, lamps and every laser that was on were told to go off") from None
     if not count:
         console.print("every device of this rig file is emulated or simulated: there is nothing to connect to")
     if not good:

@@ -1,1 +1,1 @@
-"""The twin behind the rig's interface, and emulated devices on ports."""
+"""The simulated rig: behind the rig's interface, and as emulated devices that real drivers reach through ports."""

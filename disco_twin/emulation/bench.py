@@ -53,12 +53,8 @@ class Bench:
     def __init__(self, twin: TwinRig, clock: Clock) -> None:
         config = twin.config
         if config.projector.steps > STEPS:
-            raise InputError(
-                "more mirror steps than the emulated board's DAC has",
-                key="rig.projector.steps",
-                value=config.projector.steps,
-                allowed=f"at most {STEPS}",
-            )
+            problem, key = "more mirror steps than the emulated board's DAC has", "rig.projector.steps"
+            raise InputError(problem, key=key, value=config.projector.steps, allowed=f"at most {STEPS}")
         self.twin, self.clock = twin, clock
         self.heads = [LaserHead(laser.wavelength_nm, laser.power_mw) for laser in config.lasers]
         for index, head in enumerate(self.heads):
@@ -144,7 +140,10 @@ class Bench:
         return self.twin.counts if self.light() == [pin] else 0
 
     def look(self) -> None:
-        """Put the twin into the state that the devices are in."""
+        """Put the twin into the state that the devices are in.
+
+        Raises: DiscoError where a device is in a state that was not simulated.
+        """
         now, light = self.clock.now(), self.light()
         if len(light) > 1:
             raise DiscoError(f"the simulated camera sees lasers {light} at once")

@@ -1,6 +1,6 @@
 """Emulated devices for other programs: on pseudo-terminals (the default) or TCP, served by one thread, in real time.
 
-A pseudo-terminal knows no baud rate, so the line adds the delay, and it does not say when it is opened: unlike a real
+A pseudo-terminal has no baud rate, so the cable adds the delay, and it does not report its opening: unlike a real
 board, an emulated one is not reset by that. On TCP a connection is an opening.
 """
 
@@ -16,7 +16,7 @@ import threading
 import tty
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Self
 
 from disco_twin.firmware.wire import Cable
 
@@ -25,19 +25,8 @@ log = logging.getLogger(__name__)
 POLL_S, IDLE_S = 0.001, 0.02  # while an answer is on its way, and otherwise
 
 
-class Port(Protocol):
-    """A line's outlet. `fd` is what is read and written, -1 while nobody is connected."""
-
-    url: str
-    fd: int
-
-    def register(self, selector: selectors.BaseSelector) -> None: ...
-    def ready(self, fd: int, selector: selectors.BaseSelector) -> None: ...
-    def close(self) -> None: ...
-
-
 class PtyPort:
-    """A pseudo-terminal with a name of its own: a link in a folder."""
+    """A pseudo-terminal with a name of its own: a link in a folder. `fd` is what is read and written."""
 
     def __init__(self, line: Cable, link: Path) -> None:
         self.line, self.link = line, link
@@ -66,7 +55,7 @@ class PtyPort:
 
 
 class TcpPort:
-    """A port of 127.0.0.1; one user at a time."""
+    """A port of 127.0.0.1; one user at a time. `fd` is -1 while nobody is connected."""
 
     def __init__(self, line: Cable) -> None:
         self.line = line
@@ -119,7 +108,7 @@ class Server:
 
     def __init__(self, lines: Mapping[str, Cable], folder: Path | None) -> None:
         self._lines, self._folder = dict(lines), folder
-        self._ports: dict[str, Port] = {}
+        self._ports: dict[str, PtyPort | TcpPort] = {}
         self._selector = selectors.DefaultSelector()
         self._lock, self._end = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._serve, name="emulated devices", daemon=True)
@@ -147,7 +136,7 @@ class Server:
         with self._lock:
             line = self._lines[name]
             line.plug()
-            port: Port = TcpPort(line) if self._folder is None else PtyPort(line, self._folder / name)
+            port = TcpPort(line) if self._folder is None else PtyPort(line, self._folder / name)
             port.register(self._selector)
             self._ports[name] = port
 

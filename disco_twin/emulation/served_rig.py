@@ -30,11 +30,11 @@ class Darkness:
         """Nothing to do."""
 
     def image(self, camera: int, aim: Aim, laser: int) -> F32:
-        """Nobody looks."""
+        """Refused: nothing looks."""
         raise DiscoError("these emulated devices have no camera")
 
     def silhouette(self, camera: int, angle: int) -> F32:
-        """Nobody looks."""
+        """Refused: nothing looks."""
         raise DiscoError("these emulated devices have no camera")
 
 
@@ -55,7 +55,10 @@ def emulated_devices(scene: TwinRigConfig, seed: int) -> Emulation:
 
 @contextmanager
 def served(scene: TwinRigConfig, seed: int, folder: Path) -> Iterator[Path]:
-    """Emulated devices on pseudo-terminals in a folder, and the rig file that reaches them."""
+    """Emulated devices on pseudo-terminals in a folder, and the rig file that reaches them.
+
+    Raises: InputError where a file is in the way, or another emulator serves there.
+    """
     require_folder(folder, "--ports")
     lines, path = emulated_devices(scene, seed).cables, folder / "rig.toml"
     remedy = "choose another --ports, or take it away"

@@ -103,7 +103,7 @@ class TwinRig:
         self.make_safe()
 
     def exponent(self) -> int | None:
-        """The exposure that all pixels are told to take; None: each decides for itself."""
+        """The exposure that all pixels take; None: each decides for itself."""
         return None
 
     def now(self) -> float:
@@ -111,7 +111,7 @@ class TwinRig:
         return self.clock
 
     def resume_at(self, time_s: float) -> None:
-        """Set the clock to what `now` said when the last image had been exposed."""
+        """Set the clock to the time when the last image had been exposed."""
         self.clock = time_s
 
     def announce(self, aims: Sequence[Aim]) -> None:
@@ -129,12 +129,12 @@ class TwinRig:
         self.powered = False
 
     def require_power(self) -> None:
-        """Refuse to do anything outside `with rig:`."""
+        """Refuse to do anything outside `with rig:`. Raises: Refused."""
         if not self.powered:
             raise Refused("the rig is switched off: use it inside `with rig:`")
 
     def require_dark(self, what: str) -> None:
-        """Refuse to move anything while laser light is let out."""
+        """Refuse to move anything while laser light is let out. Raises: Refused."""
         self.require_power()
         if self.scene.gate >= 0:
             raise Refused(f"the {what} must not move while the gate of laser {self.scene.gate} is open")
@@ -164,7 +164,7 @@ class TwinLaser:
         return self.rig.config.lasers[self.index].wavelength_nm
 
     def open_gate(self) -> None:
-        """Let light out; refused while another gate is open."""
+        """Let light out; refused while another gate is open. Raises: Refused."""
         self.rig.require_power()
         if self.rig.scene.gate not in (-1, self.index):
             raise Refused(f"the gate of laser {self.rig.scene.gate} is open: one laser at a time")
@@ -187,7 +187,7 @@ class TwinProjector:
     rig: TwinRig
 
     def move(self, u: int, v: int) -> None:
-        """Aim at mirror steps (u, v)."""
+        """Aim at mirror steps (u, v). Raises: InputError."""
         self.rig.require_dark("projector")
         steps = self.rig.config.projector.steps
         for name, value in (("u", u), ("v", v)):
@@ -203,18 +203,16 @@ class TwinTurntable:
     rig: TwinRig
 
     def move(self, angle_rad: float) -> None:
-        """Turn to one of the configured angles."""
+        """Turn to one of the configured angles. Raises: InputError."""
         self.rig.require_dark("turntable")
         angles = np.deg2rad(self.rig.config.turntable_angles_deg)
         away = np.abs(np.remainder(angle_rad - angles + np.pi, 2 * np.pi) - np.pi)
         nearest = int(np.argmin(away))
         if not away[nearest] < 1e-6:
-            raise InputError(
-                "the twin has no light for this turntable angle",
-                key="angle_deg",
-                value=round(float(np.rad2deg(angle_rad)), 6),
-                allowed=", ".join(f"{a:g}" for a in self.rig.config.turntable_angles_deg),
-            )
+            value = round(float(np.rad2deg(angle_rad)), 6)
+            allowed = ", ".join(f"{a:g}" for a in self.rig.config.turntable_angles_deg)
+            problem = "the twin has no light for this turntable angle"
+            raise InputError(problem, key="angle_deg", value=value, allowed=allowed)
         if nearest != self.rig.scene.angle:
             self.rig.clock += TURN_S
         self.rig.alter(angle=nearest)
@@ -248,7 +246,7 @@ class TwinTargetHolder:
     placements: int
 
     def move(self, angle_rad: float) -> None:
-        """Exchange the target, if it is not there yet."""
+        """Exchange the target, if it is not there yet. Raises: InputError."""
         self.rig.require_dark("target")
         if not 0 <= angle_rad < self.placements or angle_rad != int(angle_rad):
             raise InputError("no such target", key="placement", value=angle_rad, allowed=f"0 to {self.placements - 1}")

@@ -1,6 +1,6 @@
 """`disco-twin capture SCENE --rig rig.toml`: the capture by the devices of a rig file; the swap is this one word.
 
-The folder keeps the rig file, and knows by it that devices took its images: nothing simulates or removes them later,
+The folder keeps the rig file, which marks its images as taken by devices: nothing simulates or removes them later,
 and no other rig continues them.
 """
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def open_rig_file(run: Run, path: Path, armed: bool) -> RigFile:
-    """Read a rig file for a run; real lasers need to be armed explicitly."""
+    """Read a rig file for a run; real lasers need to be armed explicitly. Raises: InputError."""
     file = load_rig_file(path)
     require_scene(file, run.scene.rig, path)
     if file.real_lasers and not armed:

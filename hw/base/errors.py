@@ -20,15 +20,9 @@ class InputError(DiscoError):
     """Bad input: names file, key, value, the allowed range and the remedy, as far as each is known."""
 
     def __init__(
-        self,
-        problem: str,
-        *,
-        file: str | Path | None = None,
-        key: str | None = None,
-        value: object = None,
-        allowed: str | None = None,
-        remedy: str | None = None,
-    ) -> None:
+        self, problem: str, *, file: str | Path | None = None, key: str | None = None, value: object = None,
+        allowed: str | None = None, remedy: str | None = None,
+    ) -> None:  # fmt: skip
         self.problem, self.file, self.key, self.value = problem, file, key, value
         self.allowed, self.remedy = allowed, remedy
         where = "" if file is None else f"{file}: "
@@ -51,21 +45,15 @@ class Refused(DiscoError):
 
 
 class DeviceError(DiscoError):
-    """Something is wrong with a device: names its port, the device as the rig knows it, the problem and the remedy.
+    """Something is wrong with a device: names its port, the device as the rig calls it, the problem and the remedy.
 
     key, file: where the port is set, as far as known
     """
 
     def __init__(
-        self,
-        port: str,
-        device: str,
-        problem: str,
-        remedy: str,
-        *,
-        key: str | None = None,
+        self, port: str, device: str, problem: str, remedy: str, *, key: str | None = None,
         file: str | Path | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.port, self.device, self.problem, self.remedy = port, device, problem, remedy
         self.key, self.file = key, file
         where = port if key is None else f"{'' if file is None else f'{file}: '}{key} = {_shown(port)}"
@@ -78,7 +66,7 @@ class DeviceError(DiscoError):
 
 
 class NoAnswer(DeviceError):
-    """The device said nothing in time. What it was asked to do may have happened nevertheless."""
+    """The device did not answer in time. What it was asked to do may have happened nevertheless."""
 
 
 class Garbled(DeviceError):
@@ -86,7 +74,7 @@ class Garbled(DeviceError):
 
 
 class Unplugged(DeviceError):
-    """The port cannot be opened, read or written. `known`: that was said before."""
+    """The port cannot be opened, read or written. `known`: it was reported before."""
 
     known = False
 

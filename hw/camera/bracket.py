@@ -2,7 +2,7 @@
 
 Exposure k lasts `longest * 2**-k`. Every pixel keeps the longest exposure that did not saturate, as (exponent k,
 charge): thesis 4.3 in several frames instead of one. A pixel that is saturated in the shortest exposure as well shows
-the converter's full scale, whatever the sensor's own level is, so that `hw.record.to_radiance` knows it.
+the converter's full scale, whatever the sensor's own level is, which `hw.record.to_radiance` recognises.
 
 The exposure is chosen by the charge that is kept, which biases pixels within the noise of the saturation level: at a
 full well of 1e4 electrons by at most .4 % of the pixel, in a band of 2 % of the range. `hw.record.Sensor.decision_e`
@@ -38,16 +38,11 @@ class Bracket:
     def __post_init__(self) -> None:
         ascending = tuple(sorted(set(self.exponents)))
         if not ascending or self.exponents != ascending or ascending[0] != 0 or ascending[-1] > 23:
-            raise InputError(
-                "not a bracket", key="exponents", value=self.exponents, allowed="ascending from 0, at most 23"
-            )
+            allowed = "ascending from 0, at most 23"
+            raise InputError("not a bracket", key="exponents", value=self.exponents, allowed=allowed)
         if not 0 < self.saturation_dn <= self.full_scale_dn:
-            raise InputError(
-                f"not on the scale of {self.bits} bits",
-                key="saturation_dn",
-                value=self.saturation_dn,
-                allowed=f"1 to {self.full_scale_dn}",
-            )
+            problem, allowed = f"not on the scale of {self.bits} bits", f"1 to {self.full_scale_dn}"
+            raise InputError(problem, key="saturation_dn", value=self.saturation_dn, allowed=allowed)
 
     @property
     def full_scale_dn(self) -> int:

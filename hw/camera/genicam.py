@@ -1,6 +1,6 @@
 """A GenICam camera with a linear Mono sensor, bracketed into the record of the Lars III.
 
-`GenicamCamera` is the camera of `hw.interface`; it knows brackets, retries and refusals, and reaches the device through
+`GenicamCamera` is the camera of `hw.interface`; it makes brackets, retries and refuses, and reaches the device through
 a `Grabber`: five methods that any GenTL client can offer. `hw.camera.viva_grabber` has the one that ships.
 """
 
@@ -40,7 +40,7 @@ class CameraFrame:
     """One frame as the camera sent it, complete.
 
     pixels: (height, width) uint16 digital numbers, padding and packing removed; timestamp_s: the camera's own clock;
-    exposure_s: what the frame itself says of its exposure, None where the camera does not send it along
+    exposure_s: the frame's own record of its exposure, None where the camera does not send it along
     """
 
     pixels: U16
@@ -79,12 +79,15 @@ class GenicamCamera:
     _last_s: float = field(default=-np.inf, repr=False)
 
     def check(self) -> None:
-        """Refuse a camera that cannot make the bracket's exposures, before a capture depends on it."""
+        """Refuse a camera that cannot make the bracket's exposures, before a capture depends on it.
+
+        Raises: InputError.
+        """
         for exponent in self.bracket.exponents:
             self._set_exposure(exponent)
 
     def expose(self) -> RawImage:
-        """The bracket, from the longest exposure down, as far as some pixel is still saturated."""
+        """The bracket, from the longest exposure down, as far as some pixel is still saturated. Raises: CameraError."""
         return self.bracket.merge(self._frames())
 
     def black_level(self, frames: int = 4) -> tuple[float, float]:
@@ -105,12 +108,10 @@ class GenicamCamera:
         wanted = self.bracket.exposure_s(exponent)
         made = self.grabber.set_exposure(wanted)
         if not abs(made - wanted) <= TOLERANCE * wanted:
-            raise InputError(
-                f"camera {self.name} exposes for {made * 1e6:.2f} us instead of {wanted * 1e6:.2f} us",
-                key="sensor.longest_exposure_s",
-                value=self.bracket.longest_exposure_s,
-                remedy="make the shortest exposure a multiple of the camera's step, or use fewer exponents",
-            )
+            problem = f"camera {self.name} exposes for {made * 1e6:.2f} us instead of {wanted * 1e6:.2f} us"
+            remedy = "make the shortest exposure a multiple of the camera's step, or use fewer exponents"
+            key, longest = "sensor.longest_exposure_s", self.bracket.longest_exposure_s
+            raise InputError(problem, key=key, value=longest, remedy=remedy)
         return wanted
 
     def _frame(self, exponent: int) -> U16:
@@ -127,29 +128,25 @@ class GenicamCamera:
                 self.grabber.restart()
                 self._last_s = -np.inf  # some cameras count time from the start of the acquisition
                 self._set_exposure(exponent)
-        raise CameraError(
-            f"camera {self.name}: {ATTEMPTS} frames in a row were lost ({reason}). Remedy: check cable and network "
-            "card (jumbo frames, receive buffers), then repeat the command"
-        )
+        remedy = "check cable and network card (jumbo frames, receive buffers), then repeat the command"
+        raise self._error(f": {ATTEMPTS} frames in a row were lost ({reason})", remedy)
+
+    def _error(self, problem: str, remedy: str) -> CameraError:
+        return CameraError(f"camera {self.name}{problem}. Remedy: {remedy}")
 
     def _checked(self, frame: CameraFrame, wanted_s: float) -> U16:
         if frame.exposure_s is not None and not abs(frame.exposure_s - wanted_s) <= TOLERANCE * wanted_s:
             raise FrameLost(f"it was exposed for {frame.exposure_s * 1e6:.1f} us, not {wanted_s * 1e6:.1f} us")
         if frame.timestamp_s <= self._last_s:
-            raise CameraError(
-                f"camera {self.name}: its clock went back from {self._last_s:.6f} s to {frame.timestamp_s:.6f} s: it "
-                "was restarted. Remedy: repeat the command"
-            )
+            problem = f": its clock went back from {self._last_s:.6f} s to {frame.timestamp_s:.6f} s: it was restarted"
+            raise self._error(problem, "repeat the command")
         self._last_s = frame.timestamp_s
         if frame.pixels.dtype != np.uint16 or frame.pixels.shape != self.shape:
-            raise CameraError(
-                f"camera {self.name} sends {frame.pixels.shape} {frame.pixels.dtype}, the rig expects {self.shape} "
-                "uint16 (height, width). Remedy: width, height and pixel_format in the rig file"
-            )
+            sent, expected = f"{frame.pixels.shape} {frame.pixels.dtype}", f"{self.shape} uint16 (height, width)"
+            remedy = "width, height and pixel_format in the rig file"
+            raise self._error(f" sends {sent}, the rig expects {expected}", remedy)
         highest = int(frame.pixels.max())
         if highest > self.bracket.full_scale_dn:
-            raise CameraError(
-                f"camera {self.name} sends {highest}, above the {self.bracket.full_scale_dn} of {self.bracket.bits} "
-                "bits. Remedy: bits in the rig file"
-            )
+            top, bits = self.bracket.full_scale_dn, self.bracket.bits
+            raise self._error(f" sends {highest}, above the {top} of {bits} bits", "bits in the rig file")
         return frame.pixels

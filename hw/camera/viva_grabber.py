@@ -30,9 +30,8 @@ def _client() -> Any:
     try:
         return importlib.import_module("viva_genicam")
     except ImportError as error:
-        raise InputError(
-            "the camera needs the package viva-genicam", remedy="pip install 'disco-twin[genicam]'"
-        ) from error
+        remedy = "pip install 'disco-twin[genicam]'"
+        raise InputError("the camera needs the package viva-genicam", remedy=remedy) from error
 
 
 def discover() -> list[str]:
@@ -78,7 +77,7 @@ class VivaGrabber:
 
     def _connect(self, address: str) -> Any:
         vg = self._vg
-        for _ in range(3):  # discovery is a broadcast, which nobody repeats when it is lost
+        for _ in range(3):  # discovery is a broadcast, which is not repeated when it is lost
             found = [d for d in vg.discover(1000, all=True) if d.ip == address]
             if found:
                 return self._claim(found[0])
@@ -113,7 +112,7 @@ class VivaGrabber:
         return self._camera.node_info(name) is not None
 
     def _configure(self, pixel_format: str, size: tuple[int, int]) -> None:
-        """A linear sensor that exposes when it is told to, with nothing automatic about it."""
+        """Make it a linear sensor that exposes at a trigger, with nothing automatic about it."""
         camera = self._camera
         for name in OFF:
             if self._has(name):
@@ -153,24 +152,21 @@ class VivaGrabber:
         return " ".join(self._camera.get(name) for name in names if self._has(name))
 
     def set_exposure(self, seconds: float) -> float:
-        """Ask for an exposure; what the camera made of it."""
+        """Ask for an exposure; what the camera made of it. Raises: InputError, CameraError."""
         try:
             self._camera.set_exposure_time(seconds * 1e6)
             return float(self._camera.exposure_time()) * 1e-6
         except self._vg.GenApiError as error:
             limits = self._camera.feature_state("ExposureTime").range
             allowed = None if limits is None else f"{limits.min:g} to {limits.max:g} us"
-            raise InputError(
-                f"camera {self._address} refuses an exposure of {seconds * 1e6:g} us ({error})",
-                key="sensor.longest_exposure_s",
-                allowed=allowed,
-                remedy="correct sensor.longest_exposure_s and sensor.exponents",
-            ) from error
+            problem = f"camera {self._address} refuses an exposure of {seconds * 1e6:g} us ({error})"
+            key, remedy = "sensor.longest_exposure_s", "correct sensor.longest_exposure_s and sensor.exponents"
+            raise InputError(problem, key=key, allowed=allowed, remedy=remedy) from error
         except self._vg.GenicamError as error:
             raise CameraError(f"camera {self._address}: {error}") from error
 
     def grab(self, timeout_s: float) -> CameraFrame:
-        """One frame by software trigger."""
+        """One frame by software trigger. Raises: FrameLost, InputError, CameraError."""
         with self._errors(CABLE):
             self._camera.trigger_software()
             frame = self._next(timeout_s)
@@ -182,9 +178,8 @@ class VivaGrabber:
             exposure = float(self._camera.chunk_features(frame)["ChunkExposureTime"]) * 1e-6 if self._chunks else None
             pixels = np.asarray(frame.to_numpy(), np.uint16)
         if frame.ts_dev is None:
-            raise CameraError(
-                f"camera {self._address} sends no timestamps. Remedy: take one that does, or newer firmware"
-            )
+            remedy = "take one that does, or newer firmware"
+            raise CameraError(f"camera {self._address} sends no timestamps. Remedy: {remedy}")
         return CameraFrame(pixels, frame.ts_dev * self._tick_s, exposure)
 
     def _next(self, timeout_s: float) -> Any:

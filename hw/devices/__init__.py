@@ -1,1 +1,1 @@
-"""Drivers of real devices: each speaks one protocol, refuses every other device, and names the remedy in its errors."""
+"""Drivers of real devices: each speaks one protocol and refuses every other device (docs/howto/write-a-driver.md)."""

@@ -88,7 +88,7 @@ class ElliptecTable:
         self._go("ho0", 0.0, 0, HOME_S)
 
     def move(self, angle_rad: float) -> None:
-        """Turn to an angle; returns when the table stands still there."""
+        """Turn to an angle; returns when the table stands still there. Raises: DeviceFault, NoAnswer."""
         angle = degrees_of(angle_rad)
         target = round(angle / 360.0 * self._pulses)
         self._go(f"ma{target:08X}", angle, target, self.reach_s)
@@ -140,7 +140,7 @@ class ElliptecTable:
         return float(2.0 * np.pi * (self._position() / self._pulses % 1.0))
 
     def close(self) -> None:
-        """Give the port back; a move that has begun goes on, since the stage knows no stopping: a second or two."""
+        """Give the port back; a move that has begun goes on, since nothing stops the stage: a second or two."""
         self.link.close()
 
 

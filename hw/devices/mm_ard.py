@@ -128,7 +128,10 @@ class MirrorBoard:
         self._lost = action
 
     def set_mirrors(self, u: int, v: int) -> None:
-        """DAC values 0 .. 4095 of both axes, one after the other: the beam draws an L, so the gates must be shut."""
+        """DAC values 0 .. 4095 of both axes, one after the other: the beam draws an L, so the gates must be shut.
+
+        Raises: InputError.
+        """
         for channel, (name, value) in enumerate((("u", u), ("v", v))):
             if not 0 <= value < STEPS:
                 raise InputError("no such mirror step", key=name, value=value, allowed=f"0 to {STEPS - 1}")
@@ -140,6 +143,8 @@ class MirrorBoard:
 
         Understood wherever in a command the board's parser is: the longest command takes three arguments, so three
         zeros end any unfinished one (with harmless values), and otherwise they are ignored.
+
+        Raises: DeviceRefused where the board does not follow.
         """
         if not 0 <= pattern < 1 << LINES:
             raise InputError("no such pattern of TTL lines", value=pattern, allowed=f"0 to {(1 << LINES) - 1}")
@@ -172,6 +177,8 @@ class MirrorBoard:
         """The 10-bit ADC's value at an analogue pin: the median of three readings.
 
         The protocol has no checksum: one garbled reading could not be told from a right one.
+
+        Raises: InputError.
         """
         if not 0 <= pin < PINS:
             raise InputError("no such analogue pin", value=pin, allowed=f"0 to {PINS - 1}")

@@ -41,7 +41,7 @@ PROBES = ("GFw", "GSN", "GMP")  # harmless questions, to see where in the stream
 
 @dataclass(frozen=True)
 class LaserIdentity:
-    """What a laser says of itself."""
+    """What a laser reports of itself."""
 
     model: str
     firmware: str
@@ -132,7 +132,7 @@ class OmicronLaser:
         return self._ask(letters, "", lambda answer: int(answer, 16))
 
     def _refuse(self, what: str) -> NoReturn:
-        """Say why the laser does not do what it was asked for."""
+        """Raise the reason why the laser does not do what it was asked for."""
         faults = self.faults()
         if faults:
             raise self.link.error(DeviceFault, f"{what}: {'; '.join(faults)}", "remove the cause, then reset")
@@ -178,7 +178,7 @@ class OmicronLaser:
         return self._bits("GLP") / LEVELS
 
     def require_ready(self) -> None:
-        """Refuse to go on with an open interlock, a turned key or any failure."""
+        """Refuse to go on with an open interlock, a turned key or any failure. Raises: DeviceFault."""
         faults = self.faults()
         if faults:
             remedy = "remove the cause, then `reset` the laser or switch it off and on"
@@ -220,9 +220,11 @@ class OmicronLaser:
             raise failed[0]
 
     def require_off(self) -> float:
-        """Its own reading in mW, dark twice in a row; refused where it says that it emits or measures light.
+        """Its own reading in mW, dark twice in a row; refused where it reports that it emits, or measures light.
 
         That a command was answered is no proof that it was obeyed.
+
+        Raises: DeviceFault.
         """
         clock, most = self.link.clock, OFF_SHARE * self.identity.max_power_mw
         end, dark = clock.now() + OFF_S, 0
@@ -240,7 +242,7 @@ class OmicronLaser:
             clock.sleep(POLL_S)
 
     def arm(self, power_mw: float) -> None:
-        """Allow light of this power; none leaves the laser before `emit`."""
+        """Allow light of this power; none leaves the laser before `emit`. Raises: DeviceRefused, DeviceFault."""
         top = self.identity.max_power_mw
         if not 0.0 < power_mw <= top * (1.0 + 1e-9):
             problem = f"cannot be set to {power_mw:g} mW"
@@ -255,12 +257,15 @@ class OmicronLaser:
         self.armed_mw = power_mw
 
     def emit(self) -> None:
-        """Start emission; returns once the laser says that it is on. Its gate must be shut."""
+        """Start emission; returns once the laser reports that it is on. Its gate must be shut.
+
+        Raises: DeviceRefused, NoAnswer.
+        """
         if not self.armed_mw:
             raise self.link.error(DeviceRefused, "is not armed", "arm it with a power before it may emit")
         try:
             answer = self._once("LOn")
-        except NoAnswer:  # not sent again: the status says whether it was understood
+        except NoAnswer:  # not sent again: the status shows whether it was understood
             log.warning("%s: the answer to LOn was lost; asking for the status instead", self.name)
             answer = ">"
         if answer.startswith("x"):
@@ -291,6 +296,8 @@ class OmicronLaser:
         """Its own reading in mW; refused where two in a row are not its set point within this share.
 
         Answers have no checksum: one garbled digit must not stop a scan.
+
+        Raises: DeviceFault.
         """
         for _ in range(2):
             measured = self.measured_mw()
@@ -307,7 +314,7 @@ class OmicronLaser:
             self._subscriber(0.0)
 
     def reset(self) -> None:
-        """Clear latched failures by a restart of the controller (seconds), and switch off."""
+        """Clear latched failures by a restart of the controller (seconds), and switch off. Raises: NoAnswer."""
         self._inbox.clear()
         self.framer.notices.clear()
         self.link.write(b"?RsC\r")
@@ -344,7 +351,7 @@ class OmicronLaser:
     def _store_level(self, level: int) -> None:
         """SLP: the same level twice is the same level, but wears the memory that keeps it.
 
-        So it is written on change only, and not again because an answer was lost: the level itself says whether it was.
+        So it is written on change only, and not again after a lost answer: the level itself shows whether it was.
         """
         for _ in range(ATTEMPTS):
             if round(self.level() * LEVELS) == level:

@@ -57,7 +57,7 @@ class OphirMeter:
         return model
 
     def read(self) -> float:
-        """Watts on the sensor."""
+        """Watts on the sensor. Raises: DeviceFault where it is over its range."""
 
         def watts(answer: str) -> float:
             if answer.upper() == "OVER":

@@ -15,7 +15,7 @@ import numpy as np
 
 from hw.base.errors import DeviceError, DeviceFault, DeviceRefused, NoAnswer
 from hw.devices.turning import BLOCKED, POLL_S, degrees_of, not_reached
-from hw.serial.link import Inbox, Link, asked, persist
+from hw.serial.link import Inbox, LineFramer, Link, asked, persist
 
 log = logging.getLogger(__name__)
 
@@ -59,29 +59,16 @@ class ZaberFramer:
     """Answers (`@...`); alerts, information, garbage and what has a wrong checksum are dropped."""
 
     def __init__(self) -> None:
-        self._line = bytearray()
-
-    def reset(self) -> None:
-        """Forget an unfinished line."""
-        self._line.clear()
+        self._lines = LineFramer()
+        self.reset = self._lines.reset
 
     def feed(self, data: bytes) -> list[Reply]:
         """The answers that end in these bytes."""
-        replies = []
-        for byte in data:
-            if byte in b"\r\n":
-                reply = parse(self._line.decode("latin-1"))
-                if reply is not None:
-                    replies.append(reply)
-                self._line.clear()
-            else:
-                self._line.append(byte)
-        return replies
+        return [reply for line in self._lines.feed(data) if (reply := parse(line)) is not None]
 
 
 def parse(line: str) -> Reply | None:
-    """One line, or None if it is no sound answer. NULs and whatever precedes the last `@` are dropped."""
-    line = line.replace("\0", "")
+    """One line, or None if it is no sound answer. Whatever precedes the last `@` is dropped."""
     line = line[max(line.rfind("@"), 0) :]
     body, colon, check = line.rpartition(":")
     if colon and check != checksum(body[1:]):
@@ -102,7 +89,7 @@ def parse(line: str) -> Reply | None:
 
 
 class ZaberTable:
-    """A rotary stage. `microsteps_per_deg` is checked against what the stage says of itself."""
+    """A rotary stage. `microsteps_per_deg` is checked against what the stage reports of itself."""
 
     def __init__(
         self, link: Link, microsteps_per_deg: float, reach_s: float = 20.0, device: int = 1, axis: int = 1
@@ -177,7 +164,7 @@ class ZaberTable:
         self._wait(0.0, HOME_S)
 
     def move(self, angle_rad: float) -> None:
-        """Turn to an angle; returns when the table stands still there."""
+        """Turn to an angle; returns when the table stands still there. Raises: DeviceFault, NoAnswer."""
         angle = degrees_of(angle_rad)
         target = round(angle * self.microsteps_per_deg)
         self._start(f"move abs {target}")

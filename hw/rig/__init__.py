@@ -1,1 +1,1 @@
-"""The rig of real devices: what is connected where, its limits, and the capture interface in front of it."""
+"""The rig of real devices: the rig file and its rules, connection, limits, self-test, and the rig as an interface."""

@@ -46,8 +46,8 @@ class StandIns:
     """What stands in for devices that are not there: nothing, unless it is named.
 
     ports: the URL of every emulated device by its name (laser0 .., board, turntable); cameras: the simulated ones;
-    timebase, announce: of the record and of the capture's plans, with simulated cameras; subscriber: is told what real
-    devices do.
+    timebase, announce: of the record and of the capture's plans, with simulated cameras; subscriber: follows what
+    real devices do.
     """
 
     clock: Clock = field(default_factory=WallClock)
@@ -92,7 +92,10 @@ class Connector:
         return Subscriber() if port == EMULATED else self.stand_ins.subscriber
 
     def omicron(self, index: int) -> OmicronLaser:
-        """A laser's driver; connecting switches it off. Closed again if its power cannot be set."""
+        """A laser's driver; connecting switches it off. Closed again if its power cannot be set.
+
+        Raises: DeviceError, InputError.
+        """
         laser = self._dark(index)
         try:
             self._require_settable(index, laser)
@@ -119,7 +122,7 @@ class Connector:
         top, power_mw = laser.identity.max_power_mw, self.file.lasers[index].power_mw
         if OFF_SHARE * top < power_mw <= top * (1.0 + 1e-9):
             return
-        problem = f"{laser.name} ({laser.identity.model}) says that its maximum is {top:g} mW"
+        problem = f"{laser.name} ({laser.identity.model}) reports that its maximum is {top:g} mW"
         remedy = "give the power in mW"
         if power_mw < top:
             problem += f", and takes {100 * OFF_SHARE:g} % of it for darkness"
@@ -129,7 +132,7 @@ class Connector:
                          allowed=allowed, remedy=remedy)  # fmt: skip
 
     def meter(self) -> OphirMeter:
-        """The power meter's driver."""
+        """The power meter's driver. Raises: InputError without [power_meter]."""
         if self.file.power_meter is None:
             remedy = "add the table [power_meter]"
             raise InputError("the rig file has no power meter", file=self.file.path, key="power_meter", remedy=remedy)
@@ -203,7 +206,10 @@ class Connector:
 
 
 def open_camera(file: RigFile, device: GenicamDevice, shape: tuple[int, int]) -> GenicamCamera:
-    """A GenICam camera of the rig file that makes the bracket's exposures. shape: (height, width)."""
+    """A GenICam camera of the rig file that makes the bracket's exposures. shape: (height, width).
+
+    Raises: CameraError, InputError.
+    """
     from hw.camera.genicam import CameraError, GenicamCamera
     from hw.camera.viva_grabber import VivaGrabber
 

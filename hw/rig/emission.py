@@ -63,7 +63,7 @@ def check_lasers(file: RigFile, board: VerifiedBoard, lasers: Mapping[int, Laser
 
 
 def require_darkness(counts: int, device: LaserDevice, when: str, remedy: str) -> int:
-    """The photodiode's counts, refused where they are not dark. when: why they should be."""
+    """The photodiode's counts, refused where they are not dark. when: why they should be. Raises: DeviceFault."""
     if counts > DARK_COUNTS:
         problem = f"reads {counts} counts {when} (allowed: {DARK_COUNTS})"
         raise DeviceFault(f"pin {device.photodiode_pin}", f"the photodiode of {device.title}", problem, remedy)

@@ -1,6 +1,6 @@
 """Board and turntable as the rig file wants them: mirrors within their limits, angles of the rig instead of the table.
 
-What the devices of a rig do is also told to a `Subscriber`: simulated cameras see by it that a real turntable turned.
+A `Subscriber` follows what the devices do: simulated cameras see by it that a real turntable turned.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hw.serial.link import Link
 
 
 class Subscriber:
-    """Is told what the devices of a rig do; this one ignores it. No method may raise."""
+    """Follows what the devices of a rig do; this one ignores it. No method may raise."""
 
     def laser(self, index: int, power_mw: float) -> None:
         """A laser emits this power, behind its gate; 0 when it is told to go dark."""
@@ -45,13 +45,9 @@ class LimitedBoard(MirrorBoard):
         """
         for name, value, (low, high) in zip("uv", (u, v), self._limits, strict=True):
             if not low <= value <= high:
-                raise InputError(
-                    "this mirror step is outside the rig's limits",
-                    key=f"board.limits_{name}",
-                    value=value,
-                    allowed=f"{low} to {high}",
-                    remedy="widen the limits in the rig file, or aim the scene's projector so that it needs less",
-                )
+                problem, key = "this mirror step is outside the rig's limits", f"board.limits_{name}"
+                remedy = "widen the limits in the rig file, or aim the scene's projector so that it needs less"
+                raise InputError(problem, key=key, value=value, allowed=f"{low} to {high}", remedy=remedy)
         super().set_mirrors(u, v)
         self._subscriber.mirrors(u, v)
 

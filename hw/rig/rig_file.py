@@ -133,7 +133,7 @@ class SensorDevice(Strict):
         return Bracket(self.longest_exposure_s, self.exponents, self.bits, self.saturation_dn)
 
     def sensor(self) -> Sensor:
-        """What the pipeline is told."""
+        """The sensor as the pipeline uses it."""
         return Sensor(
             longest_exposure_s=self.longest_exposure_s,
             steps=self.exponents[-1] + 1,

@@ -112,7 +112,7 @@ def _require_photodiode(table: str, laser: LaserDevice) -> None:
     if limits[0] <= DARK_COUNTS / ADC_TOP:
         allowed = f"lower > {DARK_COUNTS / ADC_TOP:.2g}"
         remedy = f"raise the lower one: up to {DARK_COUNTS} of the converter's {ADC_TOP} counts are darkness"
-        raise InputError("tell no light from darkness", key=key, value=limits, allowed=allowed, remedy=remedy)
+        raise InputError("do not separate light from darkness", key=key, value=limits, allowed=allowed, remedy=remedy)
     least, most = power_w / ADC_TOP, power_w * limits[0] / DARK_COUNTS
     if least <= laser.watts_per_count < most:
         return
@@ -141,11 +141,10 @@ def _require_cameras(rig: RigFile) -> None:
     _require_distinct("the name", {f"cameras[{i}].name": camera.name for i, camera in enumerate(rig.cameras)},
                       "the scene's cameras", "name every camera of the scene once")  # fmt: skip
     real = {f"cameras[{i}].address": c.address for i, c in enumerate(rig.cameras) if isinstance(c, GenicamDevice)}
-    _require_distinct("the address", real, "one camera an address", "`disco-twin rig probe` says which camera is where")
+    _require_distinct("the address", real, "one camera an address", "`disco-twin rig probe` lists where they are")
     if real and rig.sensor is None:
-        raise InputError(
-            "required table is missing", key="sensor", remedy="GenICam cameras need [sensor]: see docs/lab.md"
-        )
+        remedy = "GenICam cameras need [sensor]: see docs/lab.md"
+        raise InputError("required table is missing", key="sensor", remedy=remedy)
     if rig.sensor is None:
         return
     _require_sensor(rig.sensor, len(rig.lasers))

@@ -171,13 +171,13 @@ def selftest(
     board = None
     if file.board.port != EMULATED:
         try:
-            board = connect.board()  # shuts the gates, whatever the lasers said
+            board = connect.board()  # shuts the gates, whatever the lasers reported
         except DiscoError as error:
             yield DeviceFinding("mirror board", False, str(error))
             return
     try:
         if not all(finding.good for finding in off):  # what may be lit is neither let out nor moved about in
-            yield DeviceFinding("gates", False, "left shut, and nothing moved: a laser did not say that it is off")
+            yield DeviceFinding("gates", False, "left shut, and nothing moved: a laser did not confirm that it is off")
             return
         if file.turntable.port != EMULATED:
             yield _try_on("turntable", connect.table, _test_table)

@@ -168,12 +168,15 @@ class SerialRig:
         return next((i for i, laser in enumerate(self.file.lasers) if board.lit(laser.gate_line)), -1)
 
     def require_guards(self) -> None:
-        """Refuse an image while nobody would switch a laser off, or after one was: asked at every image."""
+        """Refuse an image while nobody would switch a laser off, or after one was: asked at every image.
+
+        Raises: SwitchedOff.
+        """
         for laser in self.drivers().lasers:
             laser.require_guard()
 
     def require_dark(self, what: str) -> None:
-        """Refuse to move anything while laser light is let out."""
+        """Refuse to move anything while laser light is let out. Raises: Refused."""
         self.drivers()
         if self.open_gate >= 0:
             raise Refused(f"the {what} must not move while the gate of laser {self.open_gate} is open")
@@ -195,7 +198,7 @@ class GatedLaser:
         return self.rig.file.lasers[self.index].wavelength_nm
 
     def open_gate(self) -> None:
-        """Let light out; refused while another gate is open."""
+        """Let light out; refused while another gate is open. Raises: Refused, DeviceError."""
         self.rig.require_guards()
         if self.rig.open_gate not in (-1, self.index):
             raise Refused(f"the gate of laser {self.rig.open_gate} is open: one laser at a time")

@@ -24,7 +24,7 @@ SETTLE_S = 0.005  # of the galvos, after the DAC has taken both values
 
 
 class VerifiedBoard:
-    """A board whose lines are all low, what it is told from then on, and whether it still does that.
+    """A board whose lines are all low, the commands that it gets from then on, and whether it still obeys them.
 
     darken: tells every light to go out, without waiting for an answer
     """
@@ -49,7 +49,7 @@ class VerifiedBoard:
             self._darken()
 
     def ask(self, question: Callable[[Board], T]) -> T:
-        """Say something to the board. If that had to be repeated, the mirrors are not trusted any more.
+        """Use the board. Where a command had to be repeated, the mirrors are not trusted any more.
 
         A board that is reset forgets where the mirrors stand, and its armed line falls until lines are set again: a
         reset is seen by that line (`require_lines`), or by an answer that did not come at once.
@@ -82,7 +82,7 @@ class VerifiedBoard:
         self._pattern = after
 
     def require_lines(self) -> None:
-        """Refuse an image during which the board was reset: gates and mirrors have moved."""
+        """Refuse an image during which the board was reset: gates and mirrors have moved. Raises: DeviceFault."""
         found = self.ask(lambda board: board.lines())
         self._require_trust()  # it was we who shut them
         if found != self._pattern:
@@ -95,7 +95,7 @@ class VerifiedBoard:
             raise DeviceFault("board", "the mirror board", problem, "check its cable, then repeat the command")
 
     def open_gate(self, line: int) -> None:
-        """Open a gate, being certain that the mirrors stand where they were told to."""
+        """Open a gate, being certain that the mirrors stand where they were told to. Raises: DeviceFault."""
         self._require_trust()
         for _ in range(ATTEMPTS):
             if not self._aimed:
@@ -122,7 +122,7 @@ class VerifiedBoard:
     # ---- mirrors
 
     def aim(self, u: int, v: int) -> None:
-        """Mirror steps; returns when the mirrors have settled."""
+        """Mirror steps; returns when the mirrors have settled. Raises: DeviceFault."""
         self._aim = (u, v)
         for _ in range(ATTEMPTS):
             self._aimed = True

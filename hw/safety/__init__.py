@@ -1,1 +1,1 @@
-"""What keeps lasers off when a program ends: signals, and guard processes that own the lasers' ports."""
+"""Lasers go off when their program ends: ending signals, and guard processes that own the lasers' ports."""

@@ -4,7 +4,7 @@ A laser that was told to emit goes on when its port closes. So the program never
 hands bytes to and fro, and switches off when the other end of its socket closes, whatever the cause: a normal end, an
 exception, a SIGKILL; and when the program is stopped (Ctrl-Z). It is started by opening `guard://PORT`
 (`hw.safety.ports.protocol_guard`), and the first that it writes to the port switches the laser off, so that one that
-was left on goes out before anything else is said.
+was left on goes out before any other command.
 
 It does not help where no software does: a stopped computer, a broken cable while the laser is on (it switches off when
 the port returns within ten minutes). If it is itself killed, the program has to notice, see docs/lab.md.
@@ -39,7 +39,7 @@ TO_EMIT = b"LOn"
 ON_OR_PREHEATING = 1 << 1 | 1 << 2  # of GAS; a laser that preheats emits some seconds later
 TICK_S = 0.02  # how often the parent is looked after
 ANSWER_S = 0.06  # emulated and real lasers answer within 30 ms
-PATIENCE_S = 5.0  # with what does not confirm: then the user is told
+PATIENCE_S = 5.0  # with what does not confirm: then the user is warned
 RETURN_S = 600.0  # how long a laser that was told to emit, or a port that vanished, is not given up
 RETRY_S = 0.2
 READY = b"\x06"
@@ -102,7 +102,7 @@ def open_port(url: str, baud: int) -> serial.Serial:
 
 @dataclass
 class Relay:
-    """Hands bytes to and fro. `told_to_emit`: the program has said so."""
+    """Hands bytes to and fro. `told_to_emit`: the program has sent that command."""
 
     port: serial.Serial
     host: socket.socket
@@ -150,7 +150,7 @@ def _answers(port: serial.Serial, command: bytes, wanted: re.Pattern[bytes]) -> 
 
 
 def _off(port: serial.Serial) -> bool:
-    """Say off once. True if the laser says that it has done so, and then that it neither emits nor is about to."""
+    """Send the commands for off once. True if the laser confirms, and then that it neither emits nor is about to."""
     done = _answers(port, OFF, re.compile(rb"!LOf(.)")) == b">"
     _answers(port, STAY_OFF, re.compile(rb"!SAS(.)"))
     status = _answers(port, ASK, re.compile(rb"!GAS([0-9A-Fa-f]{1,4})\r"))
@@ -158,9 +158,9 @@ def _off(port: serial.Serial) -> bool:
 
 
 def switch_off(url: str, baud: int, port: serial.Serial | None, patience_s: float, complained: bool = False) -> bool:
-    """Go on saying off until the laser confirms it, by a port that is opened anew whenever it fails.
+    """Repeat the commands for off until the laser confirms them, by a port that is opened anew whenever it fails.
 
-    complained: the user knows already that the laser may be on
+    complained: the user has read already that the laser may be on
     """
     begun = time.monotonic()
     while time.monotonic() < begun + patience_s:

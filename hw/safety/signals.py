@@ -1,7 +1,7 @@
 """Signals that end a program, so that none of them ends it before its rig is safe.
 
-Python knows Ctrl-C alone: at SIGTERM, SIGHUP and SIGQUIT it would end without a `finally`, gates open and lamps lit.
-Here all four are one thing. Signals that the program ignores (nohup) stay ignored; outside the main thread Python
+Python handles Ctrl-C alone: at SIGTERM, SIGHUP and SIGQUIT it would end without a `finally`, gates open and lamps lit.
+Here all four are treated alike. Signals that the program ignores (nohup) stay ignored; outside the main thread Python
 delivers none, and nothing here does anything.
 """
 
@@ -25,7 +25,7 @@ class Interruption:
     ignoring: bool = False
 
     def handle(self, number: int, frame: FrameType | None) -> None:
-        """The first one interrupts; what follows is the end, and nothing interrupts that."""
+        """The first signal interrupts; nothing interrupts the ending that follows."""
         if not self.ignoring:
             self.ignoring = self.stopped = True
             _program.over = _program.ends
@@ -34,7 +34,7 @@ class Interruption:
 
 @dataclass
 class _Program:
-    """`ends`: it does so when it is told to. `over`: it was, and from the end of that block on ignores all signals."""
+    """`ends`: with the first interrupted block. `over`: it was interrupted; signals are ignored after that block."""
 
     ends: bool = False
     over: bool = False
@@ -46,7 +46,7 @@ _heeded: list[Interruption] = []  # of the blocks that the program is in
 
 @contextmanager
 def interruptible() -> Iterator[Interruption]:
-    """A block in which the first ending signal, whichever it is, is a KeyboardInterrupt, and the others are nothing."""
+    """A block in which the first ending signal, whichever it is, is a KeyboardInterrupt; later ones are ignored."""
     interruption = Interruption()
     caught: list[KeyboardInterrupt] = []
     try:
@@ -63,11 +63,11 @@ def interruptible() -> Iterator[Interruption]:
 
 
 def exit_on_first_signal() -> None:
-    """Said by a program that ends with the first `interruptible` block that is interrupted.
+    """Let the first `interruptible` block that is interrupted end the program.
 
-    The signals that follow are nothing then until it has ended, also while Python puts itself away, where a handler
-    would be gone: with what was made safe and said, its exit status is that of the first. A script is not told so: it
-    may go on, and be interrupted again.
+    All later signals are ignored until it has ended, also while Python shuts down and its handlers are gone: the exit
+    status is that of the first signal, after everything was made safe. A script does not call this: it may go on, and
+    be interrupted again.
     """
     _program.ends = True
 
@@ -75,7 +75,7 @@ def exit_on_first_signal() -> None:
 def raise_if_interrupted() -> None:
     """Interrupt once more where that was lost: Python swallows what is raised in a `__del__` or a weakref's callback.
 
-    To be said before each thing that takes long or lets light out.
+    To be called before each thing that takes long or lets light out.
     """
     if threading.current_thread() is threading.main_thread() and any(block.stopped for block in _heeded):
         raise KeyboardInterrupt

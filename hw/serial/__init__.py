@@ -1,1 +1,1 @@
-"""Links to serial devices: opening, framing, waiting, and the log of every byte."""
+"""Links to serial devices: opening, framing, waiting, questions and answers, and the log of every byte."""

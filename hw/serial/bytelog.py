@@ -1,7 +1,7 @@
 """The byte log: every byte to and from a device with its time, appended as it happens, and replayed as a test.
 
 One line an event: seconds, `open`, `>` (to the device), `<` (from it), `!` (an error) or `close`, and the bytes in
-hex. The first line of a file says what it is. A log that a bench has recorded is attached with `ReplayPeer`: the same
+hex. The first line of a file names the format. A log that a bench has recorded is attached with `ReplayPeer`: the same
 driver must then send the same bytes, and gets the answers that were recorded.
 """
 
@@ -36,7 +36,7 @@ class Event:
 class ByteLog:
     """Appends to a file, line by line, flushed: it is complete up to the moment of a crash.
 
-    A log that cannot be written any more (a full disk) says so once and ends: the device goes on without it.
+    A log that cannot be written any more (a full disk) ends with one warning: the device goes on without it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -73,7 +73,7 @@ class ByteLog:
 
 
 def read_log(path: Path) -> list[Event]:
-    """The events of a log; a last line that a crash has cut off is left out."""
+    """The events of a log; a last line that a crash has cut off is left out. Raises: InputError."""
     try:
         lines = path.read_text(encoding="ascii").split("\n")
     except (OSError, UnicodeDecodeError) as error:

@@ -155,7 +155,10 @@ class Link:
         return self.error(NoAnswer, f"did not answer {asked} within {limit_s:g} s", "check its cable and power")
 
     def require_guard(self) -> None:
-        """Refuse to go on if the port had a guard and has none any more; it takes no word to the device."""
+        """Refuse to go on if the port had a guard and has none any more; it takes no word to the device.
+
+        Raises: SwitchedOff.
+        """
         port: object = self._port
         gone = port.gone() if isinstance(port, GuardedPort) else None
         if gone:
@@ -243,7 +246,10 @@ class Inbox(Generic[M]):
 def asked(
     link: Link, question: str, ask_once: Callable[[], A], parse: Callable[[A], M], recover: Callable[[], None]
 ) -> M:
-    """The answer to what may be asked twice, parsed (ValueError: it cannot be); repeated as by `persist`."""
+    """The answer to what may be asked twice, parsed (ValueError: it cannot be); repeated as by `persist`.
+
+    Raises: NoAnswer, Garbled.
+    """
 
     def attempt() -> M:
         answer = ask_once()

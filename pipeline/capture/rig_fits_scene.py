@@ -21,7 +21,7 @@ MAY_CHANGE = re.compile(
 
 
 def require_scene(rig: RigFile, scene: RigConfig, path: Path) -> None:
-    """Refuse a rig file that is not this scene's rig."""
+    """Refuse a rig file that is not this scene's rig. Raises: InputError."""
 
     def wrong(problem: str, key: str, value: object, allowed: object) -> InputError:
         remedy = "take the scene of this rig, or the rig file of this scene"
@@ -43,7 +43,10 @@ def require_scene(rig: RigFile, scene: RigConfig, path: Path) -> None:
 
 
 def require_reach(rig: RigFile, plan: Plan, path: Path) -> None:
-    """Refuse mirror limits that the plan's spots leave, before hours of images and not at the first such spot."""
+    """Refuse mirror limits that the plan's spots leave, before hours of images and not at the first such spot.
+
+    Raises: InputError.
+    """
     for name, limits in (("u", rig.board.limits_u), ("v", rig.board.limits_v)):
         steps = [getattr(aim, name) for aim in plan.spots]
         if steps and not limits[0] <= min(steps) <= max(steps) <= limits[1]:
@@ -62,7 +65,10 @@ def require_reach(rig: RigFile, plan: Plan, path: Path) -> None:
 
 
 def require_same(rig: RigFile, begun_with: RigFile, path: Path) -> None:
-    """Refuse to continue a capture with another rig than it was begun with: its images would not belong together."""
+    """Refuse to continue a capture with another rig than it was begun with: its images would not belong together.
+
+    Raises: InputError.
+    """
     now, then = dict(_leaves(rig.model_dump())), dict(_leaves(begun_with.model_dump()))
     for key in [*then, *(key for key in now if key not in then)]:
         if not _same(key, now, then):
@@ -80,7 +86,7 @@ def _same(key: str, now: Mapping[str, Any], then: Mapping[str, Any]) -> bool:
     if key.endswith(".port") and not key.startswith("power_meter"):
         return (now.get(key) == EMULATED) == (then.get(key) == EMULATED)
     if key.startswith("cameras") and key.endswith(".address"):
-        serial = key.replace(".address", ".serial")  # says which camera it is, wherever it is
+        serial = key.replace(".address", ".serial")  # identifies the camera, wherever it is
         return now.get(key) == then.get(key) or now.get(serial) == then.get(serial) is not None
     return MAY_CHANGE.fullmatch(key) is not None or now.get(key) == then.get(key)
 

@@ -74,7 +74,7 @@ _SIGNALS = _Signals()
 def _hung_up(host: socket.socket) -> bool:
     """Whether the other end is closed, though bytes that it sent may still be unread."""
     poll = select.poll()
-    poll.register(host, 0)  # hanging up is always told
+    poll.register(host, 0)  # hanging up is always reported
     return bool(poll.poll(0))
 
 
@@ -86,7 +86,7 @@ class GuardedPort(SerialBase):
     _rescued = False  # the guard was found dead or stopped, and the laser is being switched off without it
 
     def open(self) -> None:
-        """Start the guard, which opens the port and says off."""
+        """Start the guard, which opens the port and switches off."""
         self._rescued = False
         self._host = self._start()
         _SIGNALS.count(1)
@@ -124,7 +124,7 @@ class GuardedPort(SerialBase):
         return ours
 
     def gone(self, wait_s: float = ENDING_S) -> str | None:
-        """Why nobody guards the laser any more, or None: to be asked before every image. It is switched off then.
+        """Why no guard looks after the laser any more, or None: asked before every image. It is switched off then.
 
         wait_s: how long a guard that has closed its socket is given to end, and so to say why.
         """
@@ -184,7 +184,7 @@ class GuardedPort(SerialBase):
             try:
                 self._guard.wait(END_S)
             except subprocess.TimeoutExpired:
-                log.info("%s: the guard is still switching off", self.port)  # it says so itself
+                log.info("%s: the guard is still switching off", self.port)  # it reports the end itself
         self._host = self._guard = None
 
     def _open_host(self) -> socket.socket:

@@ -1,7 +1,7 @@
 """pyserial's handler of `memory://NAME`: a port whose other end is an object of this process.
 
 Emulated devices and replayed logs attach themselves here, so that drivers open them as they open any port: by
-`serial.serial_for_url`. Waiting is the peer's business: it knows the clock.
+`serial.serial_for_url`. The peer waits, on its own clock.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def attach(name: str, peer: Peer) -> str:
 
 
 def detach(name: str) -> None:
-    """Nobody answers at this name any more."""
+    """Make the name unreachable again."""
     _PEERS.pop(name.lower(), None)
 
 
@@ -51,7 +51,7 @@ class MemoryPort(SerialBase):
     _peer: Peer | None = None
 
     def open(self) -> None:
-        """Find the peer and tell it."""
+        """Find the peer and notify it."""
         peer = _PEERS.get(str(self.port).removeprefix(PREFIX))
         if peer is None:
             raise SerialException(f"nothing is attached to {self.port}")
@@ -62,7 +62,7 @@ class MemoryPort(SerialBase):
         self._peer, self.is_open = peer, True
 
     def close(self) -> None:
-        """Tell the peer; a second time does nothing."""
+        """Notify the peer; a second time does nothing."""
         peer, self._peer, self.is_open = self._peer, None, False
         if peer is not None:
             peer.closed()

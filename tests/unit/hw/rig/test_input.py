@@ -171,7 +171,7 @@ def test_power_in_another_unit_is_refused_by_what_the_laser_says_of_itself(
             for run in (probe(load_rig_file(path), None), selftest(load_rig_file(path), None, armed=True)):
                 found = [next(run), next(run)]
                 assert [f.good for f in found] == [False, True]
-                assert f"{path}: lasers[0].power_mw = {power}: laser 635 nm (LuxX) says that its max" in found[0].text
+                assert f"{path}: lasers[0].power_mw = {power}: laser 635 nm (LuxX) reports that its " in found[0].text
                 assert found[0].text.endswith(f"(allowed: more than 0.1, at most 10). Remedy: {remedy}")
                 run.close()
 
