@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from rig_files import CAMERAS
 from twin_fakes import RIG, Glow
 
 from disco_twin.emulation.bench import FLOOD_LINE, LAMP_LINE
@@ -19,6 +20,7 @@ from hw.devices.omicron import OmicronLaser
 from hw.devices.omicron_protocol import Mode
 from hw.rig.connect import Connector
 from hw.rig.rig_rules import load_rig_file
+from hw.rig.serial_rig import open_rig
 
 LIT = 1 << LAMP_LINE | 1 << FLOOD_LINE | 0b11
 
@@ -118,3 +120,35 @@ def test_ctrl_c_in_connecting_is_heard_in_the_dark(
     with pytest.raises(KeyboardInterrupt):
         connector(emulated, tmp_path).connect()
     assert emulated.bench.board.lines == 0 and not any(head.on_since for head in emulated.bench.heads)
+
+
+def test_what_is_emulated_or_simulated_and_not_handed_in_is_named(tmp_path: Path) -> None:
+    """A script on hw alone. Expected: file, key and remedy, before a byte is sent to any device."""
+    path = tmp_path / "rig.toml"
+    path.write_text(rig_file_of(RIG, {}))
+    with pytest.raises(
+        InputError, match=r"rig.toml: cameras: are simulated, and none are handed in. Remedy: "
+    ) as caught:
+        open_rig(load_rig_file(path), {}, armed=True).__enter__()
+    assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match=r"rig.toml: board.port = 'emulated': nothing emulates this device here. Reme"):
+        Connector(load_rig_file(path)).connect()
+    content = path.read_text()
+    path.write_text(content[: content.index("[[cameras]]")] + CAMERAS)
+    with pytest.raises(InputError, match=r"camera front needs its size. Remedy: "):
+        open_rig(load_rig_file(path), {"back": (31, 48)}, armed=True).__enter__()
+
+
+def test_drivers_that_are_connected_for_a_block_are_dark_and_closed_after_it(tmp_path: Path) -> None:
+    """Whatever ends the block; the laser had been switched on in it."""
+    emulated = left_on()
+    connect = connector(emulated, tmp_path)
+    with pytest.raises(RuntimeError), connect.connected() as drivers:  # noqa: PT012 - a block that fails
+        assert emulated.bench.board.lines == 0 and not any(head.on_since for head in emulated.bench.heads)
+        drivers.board.set_lines(1 << LAMP_LINE)
+        drivers.lasers[1].arm(10.0)
+        drivers.lasers[1].emit()
+        assert emulated.bench.heads[1].on_since is not None
+        raise RuntimeError
+    assert emulated.bench.board.lines == 0 and not any(head.on_since for head in emulated.bench.heads)
+    assert not any(cable._users for cable in emulated.cables.values())
