@@ -16,7 +16,7 @@ from hw.safety.signals import interruptible, raise_if_interrupted
 from pipeline.capture.loop import Interrupted
 
 if TYPE_CHECKING:
-    from hw.rig.rig_file import RigFile
+    from hw.rig.rig_file import DevicesFile
     from hw.rig.selftest import DeviceFinding
 
 rig_app = typer.Typer(help="Devices: find them, test them, emulate them.")
@@ -74,7 +74,7 @@ def emulate(
             console.print("ended")
 
 
-def _loaded(path: Path, scene: Path | None, logs: Path | None) -> tuple[RigFile, dict[str, tuple[int, int]] | None]:
+def _loaded(path: Path, scene: Path | None, logs: Path | None) -> tuple[DevicesFile, dict[str, tuple[int, int]] | None]:
     """The rig file, and the sizes of the cameras of the scene that goes with it."""
     from disco_twin.scene.scene import load_scene
     from hw.base.files import require_folder

@@ -18,7 +18,7 @@ from disco_twin.firmware.wire import Cable
 from disco_twin.firmware.zaber import ZaberFirmware
 from hw.base.clock import Clock, VirtualClock, WallClock
 from hw.rig.connect import Connector, StandIns
-from hw.rig.rig_file import RigFile
+from hw.rig.rig_file import DevicesFile
 from hw.rig.serial_rig import SerialRig, open_rig
 from hw.serial.ports.protocol_memory import attach
 from pipeline.geometry.nominal_rig import RigConfig
@@ -62,7 +62,7 @@ class Emulation:
 
 
 def open_scene_rig(
-    file: RigFile, scene: RigConfig, twin: TwinRig | None = None, logs: Path | None = None, *, armed: bool
+    file: DevicesFile, scene: RigConfig, twin: TwinRig | None = None, logs: Path | None = None, *, armed: bool
 ) -> AbstractContextManager[SerialRig]:
     """The rig of a scene's rig file, whatever of it is real. `twin`: where something is emulated or simulated.
 

@@ -9,7 +9,7 @@ from disco_twin.emulation.bench import FLOOD_LINE
 from disco_twin.emulation.twin_rig import watts_per_count
 from disco_twin.firmware.zaber import MICROSTEPS_PER_DEG
 from hw.base.config import check
-from hw.rig.rig_file import EMULATED, RigFile
+from hw.rig.rig_file import EMULATED, DevicesFile
 from pipeline.geometry.nominal_rig import RigConfig
 
 LASER = """[[lasers]]
@@ -47,6 +47,6 @@ def rig_file_of(scene: RigConfig, ports: Mapping[str, str]) -> str:
     return "\n".join(parts)
 
 
-def emulated_rig_file(scene: RigConfig) -> RigFile:
+def emulated_rig_file(scene: RigConfig) -> DevicesFile:
     """The same, with every device emulated, as it is read."""
-    return check(tomllib.loads(rig_file_of(scene, {})), RigFile, "rig.toml")
+    return check(tomllib.loads(rig_file_of(scene, {})), DevicesFile, "rig.toml")

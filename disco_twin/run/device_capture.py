@@ -17,7 +17,7 @@ from disco_twin.run import simulate
 from disco_twin.run.scan import sensor_of, write_scan
 from hw.base.errors import InputError, naming
 from hw.base.files import require_folder, write_atomically
-from hw.rig.rig_file import EMULATED, RigFile
+from hw.rig.rig_file import EMULATED, DevicesFile
 from hw.rig.rig_rules import load_rig_file
 from pipeline.capture.loop import capture
 from pipeline.capture.rig_fits_scene import require_reach, require_same, require_scene
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from disco_twin.run.stages import Run
 
 
-def open_rig_file(run: Run, path: Path, armed: bool) -> RigFile:
+def open_rig_file(run: Run, path: Path, armed: bool) -> DevicesFile:
     """Read a rig file for a run; real lasers need to be armed explicitly. Raises: InputError."""
     file = load_rig_file(path)
     require_scene(file, run.scene.rig, path)
@@ -49,7 +49,7 @@ def open_rig_file(run: Run, path: Path, armed: bool) -> RigFile:
     return file
 
 
-def _begun_with(record: Path) -> RigFile:
+def _begun_with(record: Path) -> DevicesFile:
     """The rig file that a capture keeps."""
     try:
         return load_rig_file(record)
@@ -87,7 +87,7 @@ def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool
     run.stage("capture", key, take_images, "images")
 
 
-def _twin(run: Run, file: RigFile) -> TwinRig | None:
+def _twin(run: Run, file: DevicesFile) -> TwinRig | None:
     """What simulated cameras look at; emulated devices without one need no light."""
     if file.simulated_cameras:
         return simulate.twin_rig(run.experiment, run.folder.twin / "responses")

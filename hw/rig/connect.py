@@ -29,7 +29,7 @@ from hw.devices.zaber import ZaberTable
 from hw.interface import Aim, Camera
 from hw.rig.drivers import Board, Drivers, close_all
 from hw.rig.limits import LimitedBoard, PlacedTable, Subscriber
-from hw.rig.rig_file import EMULATED, GenicamDevice, RigFile, SensorDevice, ZaberDevice
+from hw.rig.rig_file import EMULATED, DevicesFile, GenicamDevice, SensorDevice, ZaberDevice
 from hw.safety.ports.protocol_guard import PREFIX
 from hw.safety.signals import uninterrupted
 from hw.serial.bytelog import ByteLog
@@ -61,7 +61,7 @@ class StandIns:
 class Connector:
     """Opens what a rig file names. logs: the folder of the byte logs, one a device."""
 
-    def __init__(self, file: RigFile, stand_ins: StandIns | None = None, logs: Path | None = None) -> None:
+    def __init__(self, file: DevicesFile, stand_ins: StandIns | None = None, logs: Path | None = None) -> None:
         self.file, self.stand_ins, self.logs = file, stand_ins or StandIns(), logs
         self.clock = self.stand_ins.clock
 
@@ -205,7 +205,7 @@ class Connector:
 # ---- cameras
 
 
-def open_camera(file: RigFile, device: GenicamDevice, shape: tuple[int, int]) -> GenicamCamera:
+def open_camera(file: DevicesFile, device: GenicamDevice, shape: tuple[int, int]) -> GenicamCamera:
     """A GenICam camera of the rig file that makes the bracket's exposures. shape: (height, width).
 
     Raises: CameraError, InputError.
@@ -250,7 +250,7 @@ def require_black(camera: GenicamCamera, sensor: SensorDevice) -> float:
 
 
 @contextmanager
-def keys_named(file: RigFile) -> Iterator[None]:
+def keys_named(file: DevicesFile) -> Iterator[None]:
     """Errors of devices that leave this block name the rig file and the key of the device's port.
 
     Drivers have their port alone, and the rig calls its board `board`.

@@ -12,7 +12,7 @@ from hw.base.errors import DeviceFault
 from hw.devices.mm_ard import ADC_TOP
 from hw.interface import LaserReading
 from hw.rig.drivers import LaserDriver
-from hw.rig.rig_file import DARK_COUNTS, LaserDevice, RigFile
+from hw.rig.rig_file import DARK_COUNTS, DevicesFile, LaserDevice
 from hw.rig.verified_board import VerifiedBoard
 from hw.safety.signals import raise_if_interrupted
 
@@ -20,7 +20,7 @@ GUARDS_EVERY_S = 0.5  # while lasers warm up
 
 
 def begin_emission(
-    clock: Clock, file: RigFile, board: VerifiedBoard, lasers: Mapping[int, LaserDriver]
+    clock: Clock, file: DevicesFile, board: VerifiedBoard, lasers: Mapping[int, LaserDriver]
 ) -> list[LaserReading]:
     """Light the warning lamp, then arm the lasers and wait for their emission, behind shut gates; what they read then.
 
@@ -47,7 +47,7 @@ def warm_up(clock: Clock, seconds: float, lasers: Iterable[LaserDriver]) -> None
             laser.require_guard()
 
 
-def check_lasers(file: RigFile, board: VerifiedBoard, lasers: Mapping[int, LaserDriver]) -> list[LaserReading]:
+def check_lasers(file: DevicesFile, board: VerifiedBoard, lasers: Mapping[int, LaserDriver]) -> list[LaserReading]:
     """Every laser's own reading, and its photodiode's in the dark: all gates are shut.
 
     Raises: DeviceFault where either is not what it should be.

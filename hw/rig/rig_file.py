@@ -153,7 +153,7 @@ class MeterDevice(Strict):
     port: Port
 
 
-class RigFile(Strict):
+class DevicesFile(Strict):
     """Every device of a rig."""
 
     format_version: Literal[1]
@@ -182,7 +182,7 @@ class RigFile(Strict):
         return max(line for line in range(LINES) if line not in used)
 
     @classmethod
-    def load(cls, path: Path) -> RigFile:
+    def load(cls, path: Path) -> DevicesFile:
         """Read a file; `hw.rig.rig_rules` then compares its keys with each other.
 
         Raises: InputError for what is no rig file.

@@ -14,21 +14,21 @@ from hw.rig.rig_file import (
     EMULATED,
     PROJECTOR_STEPS,
     BoardDevice,
+    DevicesFile,
     GenicamDevice,
     LaserDevice,
-    RigFile,
     SensorDevice,
 )
 
 SOCKET = re.compile(r"socket://[^/:?]+:\d{1,5}")  # a serial port that another machine serves
 
 
-def load_rig_file(path: Path) -> RigFile:
+def load_rig_file(path: Path) -> DevicesFile:
     """Read and check a rig file.
 
     Raises: InputError that names file, key, value, what is allowed and the remedy.
     """
-    rig = RigFile.load(path)
+    rig = DevicesFile.load(path)
     with naming(path):
         _require_wiring(rig)
         _require_mirrors(rig.board)
@@ -66,7 +66,7 @@ def _device(port: str) -> object:
     return ("device", found.st_rdev) if stat.S_ISCHR(found.st_mode) else (found.st_dev, found.st_ino)
 
 
-def _require_wiring(rig: RigFile) -> None:
+def _require_wiring(rig: DevicesFile) -> None:
     """Every line, pin and port has one user."""
     lines = {f"lasers[{i}].gate_line": laser.gate_line for i, laser in enumerate(rig.lasers)}
     lines["board.floodlight_line"] = rig.board.floodlight_line
@@ -131,7 +131,7 @@ def _require_photodiode(table: str, laser: LaserDevice) -> None:
     )
 
 
-def _require_cameras(rig: RigFile) -> None:
+def _require_cameras(rig: DevicesFile) -> None:
     """All real or all simulated, each once, with a sensor that can be."""
     kinds = [camera.kind for camera in rig.cameras]
     if len(set(kinds)) > 1:

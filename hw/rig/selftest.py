@@ -20,7 +20,7 @@ from hw.devices.turning import TurntableDriver
 from hw.rig.connect import Connector, open_camera, require_black
 from hw.rig.drivers import Board, Closable, close_all, darken
 from hw.rig.emission import begin_emission, require_darkness, require_light
-from hw.rig.rig_file import EMULATED, GenicamDevice, LaserDevice, RigFile
+from hw.rig.rig_file import EMULATED, DevicesFile, GenicamDevice, LaserDevice
 from hw.rig.verified_board import VerifiedBoard
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def _try_on(name: str, opened: Callable[[], C], check: Callable[[C], str]) -> De
     return _try(name, tried)
 
 
-def _cameras(file: RigFile, shapes: Shapes | None) -> list[tuple[str, Callable[[], GenicamCamera]]]:
+def _cameras(file: DevicesFile, shapes: Shapes | None) -> list[tuple[str, Callable[[], GenicamCamera]]]:
     """The GenICam cameras: name, and how each is opened."""
     cameras = [camera for camera in file.cameras if isinstance(camera, GenicamDevice)]
     if cameras and shapes is None:
@@ -123,7 +123,7 @@ def _cameras(file: RigFile, shapes: Shapes | None) -> list[tuple[str, Callable[[
             for device in cameras]  # fmt: skip
 
 
-def probe(file: RigFile, shapes: Shapes | None, logs: Path | None = None) -> Generator[DeviceFinding, None, None]:
+def probe(file: DevicesFile, shapes: Shapes | None, logs: Path | None = None) -> Generator[DeviceFinding, None, None]:
     """Connect to every real device and let it identify itself. Lasers are switched off and gates shut by that.
 
     shapes: (height, width) of every camera by its name; needed for GenICam cameras alone
@@ -161,7 +161,7 @@ def _metering(connect: Connector) -> Iterator[OphirMeter | None]:
 
 
 def selftest(
-    file: RigFile, shapes: Shapes | None, armed: bool, logs: Path | None = None
+    file: DevicesFile, shapes: Shapes | None, armed: bool, logs: Path | None = None
 ) -> Generator[DeviceFinding, None, None]:
     """Exercise every real device. Lasers emit, one behind an open gate at a time, only if `armed`."""
     connect = Connector(file, logs=logs)
@@ -211,7 +211,7 @@ def _test_table(table: TurntableDriver) -> str:
     return f"homed, turned to {TEST_ANGLE_DEG:g} deg and back"
 
 
-def _test_camera(file: RigFile, camera: GenicamCamera) -> str:
+def _test_camera(file: DevicesFile, camera: GenicamCamera) -> str:
     assert file.sensor is not None  # the rig file's own check
     black = require_black(camera, file.sensor)
     for _ in range(FRAMES):
@@ -219,7 +219,7 @@ def _test_camera(file: RigFile, camera: GenicamCamera) -> str:
     return f"{FRAMES} brackets, {camera.lost} frames taken again, black level {black:.1f} DN"
 
 
-def _test_mirrors(file: RigFile, board: Board) -> str:
+def _test_mirrors(file: DevicesFile, board: Board) -> str:
     for u in file.board.limits_u:
         for v in file.board.limits_v:
             board.set_mirrors(u, v)
@@ -227,7 +227,7 @@ def _test_mirrors(file: RigFile, board: Board) -> str:
     return "took every corner of their limits (look whether they moved)"
 
 
-def _test_lines(file: RigFile, board: Board) -> str:
+def _test_lines(file: DevicesFile, board: Board) -> str:
     lines = [laser.gate_line for laser in file.lasers] + [file.board.floodlight_line, file.lamp_line]
     for line in lines:
         board.set_lines(1 << line)
@@ -235,7 +235,7 @@ def _test_lines(file: RigFile, board: Board) -> str:
     return f"lines {', '.join(map(str, lines))} high and low one by one, read back"
 
 
-def _test_dark(file: RigFile, board: Board) -> str:
+def _test_dark(file: DevicesFile, board: Board) -> str:
     remedy = "shade it, or correct its amplifier's offset"
     read = [
         require_darkness(board.counts(laser.photodiode_pin), laser, "with every gate shut", remedy)

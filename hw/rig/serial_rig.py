@@ -21,7 +21,7 @@ from hw.interface import Aim, Camera, Floodlight, Laser, LaserReading, Photodiod
 from hw.rig.connect import Connector, StandIns, keys_named, open_camera, require_black
 from hw.rig.drivers import Drivers
 from hw.rig.emission import begin_emission, check_lasers, require_light
-from hw.rig.rig_file import GenicamDevice, RigFile
+from hw.rig.rig_file import DevicesFile, GenicamDevice
 from hw.rig.verified_board import VerifiedBoard
 from hw.safety.signals import uninterrupted
 
@@ -283,7 +283,7 @@ class TtlFloodlight:
 
 @contextmanager
 def open_rig(
-    file: RigFile,
+    file: DevicesFile,
     shapes: Mapping[str, tuple[int, int]],
     stand_ins: StandIns | None = None,
     logs: Path | None = None,

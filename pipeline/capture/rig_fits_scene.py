@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hw.base.errors import InputError
-from hw.rig.rig_file import EMULATED, PROJECTOR_STEPS, RigFile
+from hw.rig.rig_file import EMULATED, PROJECTOR_STEPS, DevicesFile
 from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.plan.plan import Plan
 
@@ -20,7 +20,7 @@ MAY_CHANGE = re.compile(
 )
 
 
-def require_scene(rig: RigFile, scene: RigConfig, path: Path) -> None:
+def require_scene(rig: DevicesFile, scene: RigConfig, path: Path) -> None:
     """Refuse a rig file that is not this scene's rig. Raises: InputError."""
 
     def wrong(problem: str, key: str, value: object, allowed: object) -> InputError:
@@ -42,7 +42,7 @@ def require_scene(rig: RigFile, scene: RigConfig, path: Path) -> None:
                     PROJECTOR_STEPS, scene.projector.steps)  # fmt: skip
 
 
-def require_reach(rig: RigFile, plan: Plan, path: Path) -> None:
+def require_reach(rig: DevicesFile, plan: Plan, path: Path) -> None:
     """Refuse mirror limits that the plan's spots leave, before hours of images and not at the first such spot.
 
     Raises: InputError.
@@ -64,7 +64,7 @@ def require_reach(rig: RigFile, plan: Plan, path: Path) -> None:
 # ---- against the capture that is to be continued
 
 
-def require_same(rig: RigFile, begun_with: RigFile, path: Path) -> None:
+def require_same(rig: DevicesFile, begun_with: DevicesFile, path: Path) -> None:
     """Refuse to continue a capture with another rig than it was begun with: its images would not belong together.
 
     Raises: InputError.

@@ -20,7 +20,7 @@ from disco_twin.emulation.serve import Server
 from disco_twin.emulation.served_rig import emulated_devices
 from disco_twin.emulation.twin_rig import TwinRig
 from hw.base.errors import DeviceFault, InputError
-from hw.rig.rig_file import RigFile
+from hw.rig.rig_file import DevicesFile
 from hw.rig.rig_rules import load_rig_file
 from pipeline.capture.loop import Interrupted, capture
 from pipeline.capture.rig_fits_scene import require_same, require_scene
@@ -36,7 +36,7 @@ def text(**ports: str) -> str:
     return rig_file_of(RIG, ports)
 
 
-def rig_file(tmp_path: Path, content: str) -> RigFile:
+def rig_file(tmp_path: Path, content: str) -> DevicesFile:
     path = tmp_path / "rig.toml"
     path.write_text(content)
     return load_rig_file(path)
