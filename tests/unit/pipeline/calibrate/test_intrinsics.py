@@ -91,6 +91,23 @@ def test_a_broken_stage_shows(broken: str) -> None:
     assert result.reprojection_px > 10 * good or np.abs(scores(result, actual)).max() > 10
 
 
+def test_a_lens_that_bends_much_is_found_with_its_sign() -> None:
+    """Boards through a lens that bends ten times as much as the rig's; seen again through the lens that was found."""
+    rig = faulty_rig()
+    targets, images, actual = boards(11, rig, 0)
+    board, nominal = targets.corners(), PinholeCamera.from_config(rig.cameras[0])
+    strong = replace(actual, distortion=np.array([-0.6, 0, 0, 0, 0]))
+    seen = [find_corners(image, board) for image in images]
+    straight = [None if c is None else actual.undistort((c - actual.centre) / actual.focal) for c in seen]
+    bent = [None if xy is None else strong.distort(xy) * actual.focal + actual.centre for xy in straight]
+    found = fit_intrinsics(bent, board, replace(nominal, distortion=0.9 * strong.distortion))
+    assert abs(found.values[3] + 0.6) < 4 * np.sqrt(found.covariance[3, 3])
+    lens, away = found.lens(nominal), []
+    for i, pose in zip(found.used, found.poses, strict=True):
+        away.append(replace(lens, pose=pose).project(board)[0] - bent[i])
+    assert np.sqrt((np.concatenate(away) ** 2).sum(axis=1).mean()) < 0.15
+
+
 def test_too_few_boards_are_refused_with_a_remedy() -> None:
     rig = faulty_rig()
     targets, images, _ = boards(3, rig, 0)
