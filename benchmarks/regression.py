@@ -30,7 +30,6 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
 from scipy.stats import t as student
 
-from disco_twin.evaluate.budget import VariantFolder
 from disco_twin.evaluate.stage_figures import (
     FIGURES,
     StageOutputs,
@@ -264,7 +263,7 @@ def repeated(run: Run) -> list[dict[str, float]]:
     """The pipeline again on the same capture, with each of other linear algebra kernels and one thread."""
     out = []
     for kernel in KERNELS:
-        variant = VariantFolder(run.folder.root / f"kernel-{kernel}", base=run.folder)
+        variant = run.folder.variant(run.folder.root / f"kernel-{kernel}")
         variant.work.mkdir(parents=True, exist_ok=True)
         with _environment(OPENBLAS_CORETYPE=kernel, OMP_NUM_THREADS="1"):
             reconstruct_apart(run.scene, variant, run.methods)

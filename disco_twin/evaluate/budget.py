@@ -9,8 +9,6 @@ The truth goes to the pipeline here on purpose, into folders of the twin's own, 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,23 +27,6 @@ from pipeline.calibrate.calibration import Calibration, ProjectorCalibration, no
 
 FORMAT_VERSION = 1
 RECORD = "budget.json"
-
-
-@dataclass
-class VariantFolder(RunFolder):
-    """A folder to work in beside a run's own; capture and truth are the run's."""
-
-    base: RunFolder | None = None
-
-    @property
-    def capture(self) -> Path:
-        assert self.base is not None
-        return self.base.capture
-
-    @property
-    def twin(self) -> Path:
-        assert self.base is not None
-        return self.base.twin
 
 
 def true_calibration(rig: TwinRigConfig, actual: ActualRig, nominal: Calibration) -> Calibration:
@@ -141,7 +122,7 @@ def score_budget(experiment: Experiment, folder: RunFolder, method: str) -> list
     rows = [{"calibration": "measured"} | row for row in score_relit_images(experiment, folder, (method,))]
     wanted = {"nominal": nominal} | {name: make(own, true) for name, make in VARIANTS.items()}
     for name, calibration in wanted.items():
-        variant = VariantFolder(folder.twin / "budget" / name.replace(" ", "-"), base=folder)
+        variant = folder.variant(folder.twin / "budget" / name.replace(" ", "-"))
         variant.work.mkdir(parents=True, exist_ok=True)
         given = variant.root / "calibration.json"
         calibration.save(given)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.keys import content_key, plain
+from disco_twin.light.references import load_reference, render_reference, save_reference
 from hw.base.errors import InputError
 from hw.base.files import write_atomically
 from pipeline.geometry.camera import PinholeCamera
@@ -41,8 +42,6 @@ def shipped_references(scene_file: Path, name: str) -> Path:
 
 def holds_reference(folder: Path, experiment: Experiment, light: Light, view: CameraConfig) -> bool:
     """Whether a folder holds this scene's reference of a light and view, with walks enough."""
-    from disco_twin.light.references import load_reference
-
     path = reference_path(folder, light, view)
     if not path.is_file():
         return False
@@ -58,45 +57,29 @@ def holds_reference(folder: Path, experiment: Experiment, light: Light, view: Ca
 def render_references(experiment: Experiment, shipped: Path, own: Path, progress: Progress) -> int:
     """Make sure that every reference lies in `own`: taken from `shipped`, kept from before, or rendered now.
 
-    Returns how many lights had to be rendered.
+    Returns how many lights had to be rendered. Raises: InputError where `own` is no folder.
     """
-    from disco_twin.light.references import save_reference
-
     scene, rendered = experiment.scene, 0
     lights = scene.relight.lights
     if own.exists() and not own.is_dir():
         raise InputError("is not a folder", file=own, remedy="choose another --out")
     own.mkdir(parents=True, exist_ok=True)
-
     for done, light in enumerate(lights):
         progress(done, len(lights))
-        missing = []
-        for view in scene.relight.views:
-            name = reference_path(own, light, view)
-            if holds_reference(own, experiment, light, view):
-                continue
-            if holds_reference(shipped, experiment, light, view):
-                write_atomically(name, reference_path(shipped, light, view).read_bytes())
-            else:
-                missing.append(view)
+        missing = [view for view in scene.relight.views if not holds_reference(own, experiment, light, view)]
+        for view in [view for view in missing if holds_reference(shipped, experiment, light, view)]:
+            write_atomically(reference_path(own, light, view), reference_path(shipped, light, view).read_bytes())
+            missing.remove(view)
         for size in sorted({(v.width, v.height) for v in missing}):
-            views = [v for v in missing if (v.width, v.height) == size]
-            _render(experiment, light, views, own, save_reference)
+            _render(experiment, light, [v for v in missing if (v.width, v.height) == size], own)
         rendered += bool(missing)
     progress(len(lights), len(lights))
     return rendered
 
 
-def _render(
-    experiment: Experiment, light: Light, views: Sequence[CameraConfig], own: Path, save: Callable[..., None]
-) -> None:
-    transport = experiment.transport
-    from disco_twin.light.references import render_reference
-
+def _render(experiment: Experiment, light: Light, views: Sequence[CameraConfig], own: Path) -> None:
     cameras = [PinholeCamera.from_config(v) for v in views]
     walks, seed = experiment.scene.simulation.reference_walks, experiment.seed(f"reference {light.name}")
-    for view, image in zip(views, render_reference(transport, light, cameras, walks, seed), strict=True):
-        path = reference_path(own, light, view)
-        partial = path.with_name(f"part-{path.name}")
-        save(partial, replace(image, key=reference_key(experiment.scene, light, view)))
-        partial.replace(path)
+    for view, image in zip(views, render_reference(experiment.transport, light, cameras, walks, seed), strict=True):
+        image = replace(image, key=reference_key(experiment.scene, light, view))
+        save_reference(reference_path(own, light, view), image)

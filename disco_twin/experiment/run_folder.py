@@ -54,62 +54,37 @@ class StageRecord:
 
 @dataclass
 class RunFolder:
-    """One run's folder. `identity` says which scene's capture it holds."""
+    """One run's folder; `identity` is the key of the scene whose capture it holds."""
 
     root: Path
     identity: str = ""
     stages: dict[str, StageRecord] = field(default_factory=dict)
 
-    @property
-    def scene_file(self) -> Path:
-        return self.root / "scene.toml"
-
-    @property
-    def scene_record(self) -> Path:
-        """The scene as it was run: its profile applied, its file names absolute."""
-        return self.root / "scene.json"
+    def __post_init__(self) -> None:
+        self.capture, self.twin, self.work = (self.root / name for name in FOLDERS)
+        self.scene_file, self.journal = self.root / "scene.toml", self.root / "stages.json"
+        self.scene_record = self.root / "scene.json"  # the scene as it was run: profile applied, file names absolute
+        self.summary_file, self.report_file = self.root / "summary.json", self.root / "report.html"
+        self.devices_record = self.capture / "devices.toml"  # the rig file of a capture by devices
 
     def read_scene(self) -> Scene:
         """Read `scene_record`. Raises: InputError."""
         return read_json(self.scene_record, Scene, f"disco-twin run SCENE --out {self.root} writes it anew")
 
     @property
-    def capture(self) -> Path:
-        return self.root / "capture"
-
-    @property
-    def devices_record(self) -> Path:
-        """The rig file of a capture by devices."""
-        return self.capture / "devices.toml"
-
-    @property
     def taken_by_devices(self) -> bool:
         """Whether devices took this folder's images: nothing simulates them again or removes them."""
         return self.devices_record.is_file()
 
-    @property
-    def twin(self) -> Path:
-        return self.root / "twin"
-
-    @property
-    def work(self) -> Path:
-        return self.root / "work"
-
-    @property
-    def journal(self) -> Path:
-        return self.root / "stages.json"
-
-    @property
-    def summary_file(self) -> Path:
-        return self.root / "summary.json"
-
-    @property
-    def report_file(self) -> Path:
-        return self.root / "report.html"
+    def variant(self, root: Path) -> RunFolder:
+        """A folder to reconstruct in beside this run's own work; capture and truth are this run's."""
+        folder = RunFolder(root)
+        folder.capture, folder.twin = self.capture, self.twin
+        return folder
 
     @classmethod
     def open(cls, root: Path) -> RunFolder:
-        """An existing run folder."""
+        """An existing run folder. Raises: InputError where it is none, or its journal cannot be read."""
         folder = cls(root)
         if not folder.journal.is_file():
             raise InputError("is no run folder", file=root, remedy="give the --out folder of `disco-twin run`")
@@ -118,23 +93,20 @@ class RunFolder:
 
     @classmethod
     def claim(cls, root: Path, scene_file: Path, identity: str) -> RunFolder:
-        """The folder for this scene: made, or resumed; a folder that holds anything else is refused."""
+        """The folder for this scene: made, or resumed. Raises: InputError for a folder that holds anything else."""
         folder = cls(root, identity)
         if root.exists() and not root.is_dir():
             raise InputError("is not a folder", file=root, remedy="choose another --out")
         if folder.journal.is_file():
             folder._load_or_begin_anew(identity)
             if folder.identity != identity:
-                raise InputError(
-                    "the folder holds the run of another scene or profile, or the scene has changed since",
-                    file=root,
-                    remedy="choose another --out, or delete this one",
-                )
+                problem = "the folder holds the run of another scene or profile, or the scene has changed since"
+                raise InputError(problem, file=root, remedy="choose another --out, or delete this one")
         elif root.is_dir() and not _barely_begun(root):
             raise InputError("the folder is not empty and holds no run", file=root, remedy="choose another --out")
         folder.identity = identity
-        for path in (folder.capture, folder.twin, folder.work):
-            path.mkdir(parents=True, exist_ok=True)
+        for name in FOLDERS:
+            (root / name).mkdir(parents=True, exist_ok=True)
         with folder.alone():
             write_atomically(folder.scene_file, scene_file.read_bytes())
             folder._save()
@@ -145,6 +117,7 @@ class RunFolder:
 
         outputs: patterns of the files that it leaves; where one is missing or cut later, the stage is done again.
         `work` may return the peak memory in MiB of a process of its own, which then counts as the stage's.
+        Raises: DiscoError where another process works in the folder, and what `work` raises.
         """
         with self.alone():
             if self.journal.is_file():
@@ -185,9 +158,8 @@ class RunFolder:
         handle = os.open(self.root, os.O_RDONLY)
         try:
             if not take_lock(handle):
-                raise DiscoError(
-                    f"{self.root}: another process works in this folder. Remedy: wait for it, or choose another --out"
-                )
+                problem = f"{self.root}: another process works in this folder"
+                raise DiscoError(f"{problem}. Remedy: wait for it, or choose another --out")
             yield
         finally:
             os.close(handle)
@@ -200,7 +172,7 @@ class RunFolder:
     def _load_or_begin_anew(self, identity: str) -> None:
         """A journal that cannot be read is begun anew: what stages left is looked at again, nothing is lost.
 
-        Light that other code or another scene made is known by its own key (twin/light.key).
+        Light that other code made is known by keys of its own (twin/*.key).
         """
         try:
             self._load()
@@ -213,12 +185,8 @@ class RunFolder:
             self.identity = identity
 
     def _save(self) -> None:
-        data = {
-            "format_version": FORMAT_VERSION,
-            "identity": self.identity,
-            "stages": [asdict(s) for s in self.stages.values()],
-        }
-        write_json(self.journal, data)
+        stages = [asdict(record) for record in self.stages.values()]
+        write_json(self.journal, {"format_version": FORMAT_VERSION, "identity": self.identity, "stages": stages})
 
 
 class _Journal(Strict):
@@ -230,7 +198,7 @@ class _Journal(Strict):
 
 
 def _of_another_version(journal: Path) -> bool:
-    """Whether the journal can be read, and says that other code wrote it."""
+    """Whether the journal can be read, and is of another format version."""
     try:
         return bool(json.loads(journal.read_bytes()).get("format_version", FORMAT_VERSION) != FORMAT_VERSION)
     except (ValueError, AttributeError):

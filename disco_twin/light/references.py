@@ -60,8 +60,8 @@ def render_reference(
 
 
 def save_reference(path: Path, reference: Reference) -> None:
-    """One EXR of half floats, channels `<layer>.<half>.<laser>`, scaled so that the brightest value is 6e4: half floats
-    then resolve light that is ten decades fainter.
+    """Replace one EXR of half floats, channels `<layer>.<half>.<laser>`, scaled so that the brightest value is 6e4:
+    half floats then resolve light that is ten decades fainter.
     """
     import OpenEXR
 
@@ -81,7 +81,9 @@ def save_reference(path: Path, reference: Reference) -> None:
         "key": reference.key,
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    OpenEXR.File(header, channels).write(str(path))
+    fresh = path.with_name(f"part-{path.name}")
+    OpenEXR.File(header, channels).write(str(fresh))
+    fresh.replace(path)
 
 
 def load_reference(path: Path) -> Reference:
