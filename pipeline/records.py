@@ -11,7 +11,7 @@ from hw.record import Sensor
 from pipeline.geometry.nominal_rig import RigConfig
 
 
-class RigFile(Strict):
+class NominalRigFile(Strict):
     """CAPTURE/rig.json: the nominal rig."""
 
     format_version: Literal[1]

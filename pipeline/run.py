@@ -47,7 +47,7 @@ from pipeline.reconstruct.samples.image_operators import IMAGE_OPERATORS
 from pipeline.reconstruct.samples.samples import Samples, SampleStatistics, take_samples
 from pipeline.reconstruct.samples.samples_file import save_samples
 from pipeline.reconstruct.settings import ReconstructConfig
-from pipeline.records import RigFile, SensorFile
+from pipeline.records import NominalRigFile, SensorFile
 from pipeline.relight.lights import Light
 from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 from pipeline.stream.stream import StreamReader
@@ -66,7 +66,7 @@ class RelightRequest(Strict):
 
 
 class Request(Strict):
-    """What the pipeline is asked to do."""
+    """How to reconstruct, and what to relight."""
 
     format_version: Literal[1]
     reconstruct: ReconstructConfig = ReconstructConfig()
@@ -91,7 +91,7 @@ class Stages:
 def gather(
     capture: Path, calibration: Calibration, mesh: trimesh.Trimesh, settings: ReconstructConfig, stages: Stages
 ) -> tuple[dict[str, Samples], SampleStatistics]:
-    """Views, then samples, for every kind of image operator that the methods ask for (by footprint in any case)."""
+    """Views, then samples, for every kind of image operator that a method declares (by footprint in any case)."""
     kinds = dict.fromkeys(["footprint", *(known_methods()[name].reads for name in settings.methods)])
     with stages.stage("views"):
         cameras = [calibration.view_camera(v) for v in range(len(calibration.views))]
@@ -125,11 +125,14 @@ def relight(models: dict[str, RelightableModel], request: Request, work: Path, s
 
 
 def run(capture: Path, work: Path, request: Request, given: Path | None = None) -> dict[str, Any]:
-    """Everything; returns what pipeline.json holds. given: a calibration file from before, instead of a new one."""
+    """Everything; returns what pipeline.json holds. given: a calibration file from before, instead of a new one.
+
+    Raises: InputError for a capture that cannot be reconstructed.
+    """
     stages, settings = Stages(), request.reconstruct
     work.mkdir(parents=True, exist_ok=True)
     with stages.stage("calibration"):
-        rig = read_json(capture / "rig.json", RigFile, CAPTURE_AGAIN).rig
+        rig = read_json(capture / "rig.json", NominalRigFile, CAPTURE_AGAIN).rig
         sensor = read_json(capture / "sensor.json", SensorFile, CAPTURE_AGAIN).sensor
         mesh = read_scan(capture / "scan.ply")
         calibration, calibrated = calibrate(capture, rig, sensor, mesh, given)
@@ -175,12 +178,15 @@ def run(capture: Path, work: Path, request: Request, given: Path | None = None) 
 def calibrate(
     capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh, given: Path | None
 ) -> tuple[Calibration, dict[str, Any]]:
-    """From the rig's own images where there are any, else nominal; and what the stages of a measurement found."""
+    """From the rig's own images where there are any, else nominal; and what the stages of a measurement found.
+
+    Raises: InputError where the camera is not linear and its response is not known.
+    """
     if given is not None:
         known = Calibration.load(given)
         if rig.sensor.response == "curved" and not known.sensor.response:
             raise InputError(
-                "the camera is not linear, and this calibration does not know its response",
+                "the camera is not linear, and this calibration lacks its response",
                 file=given,
                 key="sensor.response",
                 value=list(known.sensor.response),
@@ -202,7 +208,7 @@ def calibrate(
 
 
 def warnings_of(statistics: SampleStatistics) -> list[str]:
-    """What a reader of the results should know about the data."""
+    """The data's defects, one line each."""
     out = [f"damaged and left out: {address}" for address in statistics.corrupt]
     if statistics.spots_too_oblique:
         out.append(f"{statistics.spots_too_oblique} of {statistics.spots} spots miss the scan or are too oblique")
@@ -224,7 +230,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         threading.Thread(target=_end_with_stdin, daemon=True).start()
     logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(levelname)s %(name)s: %(message)s")
     try:
-        request = read_json(options.request, Request, "write it as docs/conventions.md says")
+        request = read_json(options.request, Request, "write it as docs/conventions.md shows")
         run(options.capture, options.work, request, options.calibration)
     except DiscoError as error:
         sys.stderr.write(f"{error}\n")

@@ -51,7 +51,7 @@ def walks_below_camera(scene: Scene) -> float:
 
 
 def measured_noise(scene: Scene, responses: Path) -> dict[str, Any] | None:
-    """What the simulated spots' own variances say, over pixels that a walk reached; None without simulated spots.
+    """The simulated spots' variances beside the camera's, over pixels that a walk reached; None without any.
 
     median_over_camera: of the standard deviations' ratio; above_camera: share of pixels where it exceeds one;
     walks_below_camera: walks a spot that would bring it below one in 99 of 100 of these pixels.

@@ -1,4 +1,4 @@
-"""A run folder's results as the report wants them."""
+"""What the report shows, read from a run folder."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def collect(experiment: Experiment, folder: RunFolder, summary: dict[str, Any]) 
 
 
 def notes(experiment: Experiment) -> list[str]:
-    """What a reader must know before believing the figures."""
+    """Conditions under which the figures hold."""
     if experiment.scene.rig.faults.deviation:
         return ["The actual rig deviates from the nominal one; the pipeline is given the nominal one only."]
     return [

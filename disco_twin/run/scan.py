@@ -9,7 +9,7 @@ from disco_twin.experiment.capturable import require_capturable
 from disco_twin.experiment.experiment import Experiment
 from hw.base.files import write_atomically
 from hw.record import Sensor
-from pipeline.records import RigFile, SensorFile
+from pipeline.records import NominalRigFile, SensorFile
 
 
 def sensor_of(experiment: Experiment, real: Sensor | None = None) -> Sensor:
@@ -20,7 +20,7 @@ def sensor_of(experiment: Experiment, real: Sensor | None = None) -> Sensor:
 def write_scan(experiment: Experiment, capture: Path, sensor: Sensor | None = None) -> None:
     """The nominal rig, its sensor, the scanned mesh. Raises: InputError, see `require_capturable`."""
     require_capturable(experiment)
-    rig = RigFile(format_version=1, rig=experiment.scene.rig.nominal())
+    rig = NominalRigFile(format_version=1, rig=experiment.scene.rig.nominal())
     known = SensorFile(format_version=1, sensor=sensor_of(experiment, sensor))
     write_atomically(capture / "scan.ply", bytes(experiment.scan.export(file_type="ply")))
     write_atomically(capture / "rig.json", rig.model_dump_json(indent=1).encode())

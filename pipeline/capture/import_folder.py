@@ -33,7 +33,7 @@ from hw.interface import Aim
 from hw.record import Sensor
 from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.plan.plan import ImageAddress, Plan
-from pipeline.records import RigFile, SensorFile
+from pipeline.records import NominalRigFile, SensorFile
 from pipeline.stream.layout import ImageMeta
 from pipeline.stream.stream import StreamWriter
 
@@ -86,7 +86,7 @@ def import_capture(folder: Path, out: Path, progress: Callable[[int, int], None]
     with StreamWriter(out, plan) as stream:
         write_atomically(out / "scan.ply", _scan(described.scan))
         write_atomically(
-            out / "rig.json", RigFile(format_version=1, rig=described.rig).model_dump_json(indent=1).encode()
+            out / "rig.json", NominalRigFile(format_version=1, rig=described.rig).model_dump_json(indent=1).encode()
         )
         write_atomically(
             out / "sensor.json",

@@ -26,7 +26,7 @@ Degrees = Annotated[float, Field(gt=0, lt=90)]
 class ReconstructConfig(Strict):
     """What the pipeline assumes and which data it trusts.
 
-    eta: refractive index that is assumed; the pipeline is never told the scene's
+    eta: refractive index that is assumed; the scene's own stays with the twin
     max_incidence_deg: spots that the laser meets more obliquely are left out
     max_view_deg: surface that a camera sees more obliquely is left out
     highlight_deg: a spot's surroundings are not read by a camera within this angle of its mirror direction (measured

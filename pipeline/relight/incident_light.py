@@ -20,7 +20,7 @@ _SHIFT = 0.7548776662466927  # turns from one point's lattice to the next point'
 
 
 def colour(light: Uniform | Directional | Beam | TexturedProjector, lasers: int) -> F64:
-    """(L,) factors of the first `lasers` wavelengths."""
+    """(L,) factors of the first `lasers` wavelengths. Raises: InputError where the light has fewer."""
     return _first(light.colour, lasers, light.name)
 
 
@@ -53,7 +53,10 @@ def from_one_direction(light: Directional | Beam | TexturedProjector, points: F6
 
 
 def edge_normal(light: Directional) -> F64:
-    """(3,) unit vector across the direction of light, pointing to the lit side of its shadow edge."""
+    """(3,) unit vector across the direction of light, pointing to the lit side of its shadow edge.
+
+    Raises: ValueError for a light without an edge.
+    """
     if light.edge_side is None:
         raise ValueError(f"light '{light.name}' has no edge")
     along, side = _unit(light.direction), np.array(light.edge_side, np.float64)
@@ -95,6 +98,7 @@ def from_many_directions(light: Uniform | Environment, normals: F64, count: int,
 
     Each set is (N, count, 3) unit directions towards the light and (L, N, count) weights in W/mm^2, such that
     sum_k weight_k f(direction_k) approximates the integral of L(w) f(w) cos dw. Cosines below zero weigh 0.
+    Raises: InputError where the light has fewer colours than `lasers`.
     """
     if isinstance(light, Uniform):
         light = Environment(constant=tuple(light.radiance * x for x in light.colour), name=light.name)

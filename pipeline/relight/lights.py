@@ -1,6 +1,6 @@
 """Lights, as one file format for the pipeline's irradiance and the twin's references. Object frame, mm, W.
 
-The pipeline asks a light for the radiation that arrives at a surface point; the twin launches photons from it.
+The pipeline works out what arrives from a light at a surface point; the twin launches photons from it.
 Colours are factors per laser wavelength.
 """
 

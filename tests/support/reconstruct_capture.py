@@ -13,7 +13,7 @@ from pipeline.geometry.fresnel import transmittance
 from pipeline.geometry.mesh import first_hit
 from pipeline.geometry.nominal_rig import CameraConfig, LaserConfig, ProjectorConfig, RigConfig, SensorConfig
 from pipeline.plan.plan import ImageAddress, Plan, make_plan
-from pipeline.records import RigFile, SensorFile
+from pipeline.records import NominalRigFile, SensorFile
 from pipeline.stream.stream import ImageMeta, StreamWriter
 
 RADIUS = 15.0
@@ -90,7 +90,7 @@ def write_capture(folder: Path, subdivisions: int = 2, scan: trimesh.Trimesh | N
             meta = ImageMeta(n / 15, power, angle, aim.u if aim else -1, aim.v if aim else -1)
             stream.append(address, raw, meta)
     mesh.export(folder / "scan.ply")
-    (folder / "rig.json").write_text(RigFile(format_version=1, rig=config).model_dump_json())
+    (folder / "rig.json").write_text(NominalRigFile(format_version=1, rig=config).model_dump_json())
     (folder / "sensor.json").write_text(SensorFile(format_version=1, sensor=SENSOR).model_dump_json())
     assert (first_hit(mesh, *calibration.spot_rays(plan.spots)).triangle >= 0).all()
     return mesh

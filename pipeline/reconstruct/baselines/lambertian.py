@@ -36,7 +36,9 @@ def spot_energies(samples: Samples, laser: int) -> F64:
 
 @method("lambertian", about="an opaque surface of one albedo a vertex", baseline=True, colour="#8d93a0")
 def fit_lambertian(samples: Samples) -> RelightableModel:
-    """The baseline: samples -> model. The albedo is interpolated between the spots by kriging."""
+    """The baseline: samples -> model. The albedo is kriged between the spots (Rasmussen & Williams 2006,
+    eq. 2.25).
+    """
     edge = float(samples.mesh.edges_unique_length.mean())
     covariance = harmonics(samples.mesh, MOST_HARMONICS).covariance(RANGE_EDGES * edge)
     to_spots = interpolation(samples.mesh, samples.spots.triangle, samples.spots.barycentric)

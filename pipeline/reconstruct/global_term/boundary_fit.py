@@ -1,9 +1,9 @@
-"""How light leaves at grazing angles: the boundary's transmittance, measured against the assumed one.
+"""The boundary's transmittance at grazing angles, measured against that of the assumed index (F_t of thesis eq. 2.1).
 
-The samples come from views that are not too oblique. The same images show the same surface at grazing angles too, and
-there a rough surface transmits up to twice what the smooth one of the assumed index does, which is most of the error
-of a relit image near its outline. So the images of all spots are summed and compared, by view cosine, with what the
-model expects; by reciprocity the ratio holds for light that enters, too.
+Samples come from views that are not too oblique. The same images show the surface at grazing angles too, where a rough
+one transmits up to twice what the smooth one of the assumed index does: most of a relit image's error near the outline.
+The images of all spots are summed and compared, by view cosine, with what the model expects. By reciprocity the ratio
+holds for light that enters, too.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ LEAST, MOST = 0.5, 2.0  # of the smooth transmittance; at the outline itself sca
 SUPERSAMPLE = 3
 
 
-def _accumulate(mesh: trimesh.Trimesh, glow: SpotSumImage, radiosity: F64, eta: float) -> tuple[F64, F64]:
+def _accumulate(mesh: trimesh.Trimesh, view: SpotSumImage, radiosity: F64, eta: float) -> tuple[F64, F64]:
     """Sums over the samples of one view by bin of view cosine: observed, and expected with the smooth F_t.
 
     radiosity: (L, V) expected sum over the view's spots at the vertices, mm^-2
     """
-    camera, bins = glow.camera, len(EDGES) - 1
+    camera, bins = view.camera, len(EDGES) - 1
     observed, expected = np.zeros(bins), np.zeros(bins)
-    image = glow.image.reshape(len(glow.image), -1)
+    image = view.image.reshape(len(view.image), -1)
     for band in trace_pixels(mesh, camera, SUPERSAMPLE):
         whole = np.bincount(band.pixel, minlength=image.shape[1])[band.pixel] == SUPERSAMPLE**2
         use = np.flatnonzero(whole & (band.cosine > 0))
@@ -46,17 +46,17 @@ def _accumulate(mesh: trimesh.Trimesh, glow: SpotSumImage, radiosity: F64, eta: 
 
 
 def measure_boundary(
-    mesh: trimesh.Trimesh, eta: float, glows: tuple[SpotSumImage, ...], expected: Callable[[SpotSumImage], F64]
+    mesh: trimesh.Trimesh, eta: float, views: tuple[SpotSumImage, ...], expected: Callable[[SpotSumImage], F64]
 ) -> Boundary:
     """The boundary with its measured ratio.
 
-    expected: view -> (L, S, V) the model's R_d between spots and vertices, as seen from there. What directions do
-    beside the boundary must be in it, or the ratio would take it for the boundary's.
+    expected: view -> (L, S, V) mm^-2, the model's R_d between spots and vertices as seen from there, with all that
+    directions do beside the boundary: the ratio holds whatever is left.
     """
     seen, model = np.zeros(len(EDGES) - 1), np.zeros(len(EDGES) - 1)
-    for glow in glows:
-        radiosity = np.einsum("ls,lsv->lv", glow.included.astype(np.float64), expected(glow))
-        s, m = _accumulate(mesh, glow, radiosity, eta)
+    for view in views:
+        radiosity = np.einsum("ls,lsv->lv", view.included.astype(np.float64), expected(view))
+        s, m = _accumulate(mesh, view, radiosity, eta)
         seen += s
         model += m
     known = np.flatnonzero(model > 1e-3 * model.max(initial=0.0))

@@ -6,8 +6,8 @@ G solves one symmetric positive definite system: the samples at the spots' baryc
 reciprocity, rows; smoothness over the surface on both sides fills the rest. Values are compared with their expectation
 linearly and weighted by precision (`Measured.residual`), so that a noisy tail neither dominates nor turns negative.
 
-The fit fills what was not measured. An entry next to a spot holds the sample itself, as far as noise lets it speak
-(`hold_measured`): nothing that was measured is overwritten by fill (docs/decisions/0013).
+The fit fills what was not measured. An entry next to a spot holds the sample itself, as far as its noise
+allows (`hold_measured`): fill overwrites nothing that was measured (docs/decisions/0013).
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def hold_measured(
     nothing was measured.
 
     A sample is the mean over a beam and a hat function in one direction, an entry the mean over two hat functions and
-    all directions. The fit says what lies between: sample / its expectation = entry / its expectation. Spots whose
+    all directions. The fit links the two: sample / its expectation = entry / its expectation. Spots whose
     triangle the vertex belongs to are averaged by their share and precision, and by reciprocity from both sides. A
     measured entry is the mean of that and of the fill, by their precisions: the sample itself unless noise drowns it.
     """
@@ -181,7 +181,8 @@ def hold_measured(
 
 
 def unexplained(samples: Samples, basis: Harmonics, range_mm: float) -> F64:
-    """(V, V) share of the prior variance of G that the samples leave, 0..1, by kriging from either side.
+    """(V, V) share of the prior variance of G that the samples leave, 0..1, by kriging from either side (Rasmussen &
+    Williams 2006, eq. 2.26).
 
     From the side of u: the share that spots leave at u, where those spots saw v; the better of both sides counts.
     """

@@ -32,7 +32,7 @@ from hw.base.errors import InputError, naming, refused_by_the_disk
 from hw.base.files import write_atomically
 from pipeline.geometry.distortion import covers_image
 from pipeline.geometry.nominal_rig import CameraConfig
-from pipeline.records import MethodFigures, PipelineRecord, RigFile
+from pipeline.records import MethodFigures, NominalRigFile, PipelineRecord
 
 
 def one_line(caught: pytest.ExceptionInfo[InputError], *parts: str) -> None:
@@ -204,7 +204,7 @@ def test_distortion_must_be_one_to_one(distortion: tuple[float, ...], good: bool
 def test_damaged_json(content: str, tmp_path: Path) -> None:
     path = tmp_path / "f.json"
     path.write_text(content)
-    for schema in (PipelineRecord, Scene, RigFile):
+    for schema in (PipelineRecord, Scene, NominalRigFile):
         with pytest.raises(InputError) as caught:
             read_json(path, schema, "do that")
         one_line(caught, str(path), "do that")

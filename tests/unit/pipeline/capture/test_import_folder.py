@@ -18,7 +18,7 @@ from hw.base.errors import InputError
 from hw.camera.bracket import Bracket
 from pipeline.capture.import_folder import COLUMNS, import_capture
 from pipeline.capture.quality import examine
-from pipeline.records import RigFile, SensorFile
+from pipeline.records import NominalRigFile, SensorFile
 from pipeline.stream.stream import StreamReader
 
 HEIGHT, WIDTH = 31, 48
@@ -121,7 +121,7 @@ def test_every_image_is_the_record_of_its_bracket(folder: Path, tmp_path: Path) 
                 assert meta.photodiode_w == pytest.approx(np.average(0.01 + 0.001 * np.arange(4), weights=weights))
                 assert (meta.u, meta.v) == (aim.u, aim.v)
         qualities = list(examine(stream, read_json(out / "sensor.json", SensorFile, "").sensor))
-    assert read_json(out / "rig.json", RigFile, "").rig.cameras[1].name == "back"
+    assert read_json(out / "rig.json", NominalRigFile, "").rig.cameras[1].name == "back"
     assert [(q.stored, q.planned, q.spots, q.dark, q.damaged) for q in qualities] == [
         (5, 5, 2, 0, 0),
         (3, 3, 1, 0, 0),
