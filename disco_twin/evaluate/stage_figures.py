@@ -35,7 +35,7 @@ from disco_twin.faults.actual_rig import ActualRig, actual_rig
 from disco_twin.light.references import LAYERS, load_reference
 from disco_twin.light.truth import Truth
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
-from pipeline.geometry.mesh import first_hit
+from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.scan import read_scan
 from pipeline.plan.plan import Plan
 from pipeline.reconstruct.samples.distances import beam_footprints
@@ -135,7 +135,7 @@ def projector_figures(outputs: StageOutputs, true: TrueRun) -> dict[str, float]:
     frames = object_frames(calibration, true.calibration)
     at = np.array([aim.angle for aim in aims])
     turned = np.stack(frames)[at]
-    hit = first_hit(true.scan, *true.calibration.spot_rays(aims))
+    hit = RayMesh.of(true.scan).first_hit(*true.calibration.spot_rays(aims))
     place = (true.scan.triangles[np.maximum(hit.triangle, 0)] * hit.barycentric[:, :, None]).sum(axis=1)
     origins, directions = calibration.spot_rays(aims)
     origins = np.einsum("sij,sj->si", turned[:, :3, :3], origins) + turned[:, :3, 3]
@@ -212,7 +212,7 @@ def all_figures(outputs: StageOutputs, true: TrueRun) -> dict[str, float]:
 def _hits(experiment: Experiment, actual: ActualRig) -> F64:
     """(S, 3) mm, where the beams' axes met the object, mirror errors included; NaN where one missed."""
     mesh = experiment.object.mesh
-    hit = first_hit(mesh, *actual.spot_rays(experiment.plan.spots))
+    hit = RayMesh.of(mesh).first_hit(*actual.spot_rays(experiment.plan.spots))
     place = (mesh.triangles[np.maximum(hit.triangle, 0)] * hit.barycentric[:, :, None]).sum(axis=1)
     return np.where(hit.triangle[:, None] >= 0, place, np.nan)
 

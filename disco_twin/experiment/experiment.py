@@ -67,10 +67,10 @@ class Experiment:
 
     def object_mask(self, view: CameraConfig) -> NDArray[np.bool_]:
         """(H, W) pixels of a held-out view that the object fills by at least a half."""
-        from pipeline.geometry.mesh import first_hit
+        from pipeline.geometry.mesh import RayMesh
 
         camera = PinholeCamera.from_config(view)
-        face = first_hit(self.object.mesh, *camera.rays(camera.pixel_centres(SUPERSAMPLE))).triangle
+        face = RayMesh.of(self.object.mesh).first_hit(*camera.rays(camera.pixel_centres(SUPERSAMPLE))).triangle
         fine = (face >= 0).reshape(camera.height, SUPERSAMPLE, camera.width, SUPERSAMPLE)
         return np.asarray(fine.mean(axis=(1, 3)) >= 0.5)
 

@@ -18,6 +18,7 @@ from scipy import sparse
 from disco_twin.light.balance import EnergyBalance
 from hw.base.files import load_arrays, save_arrays
 from pipeline.geometry.fresnel import mean_transmittance
+from pipeline.geometry.mesh import RayMesh
 
 if TYPE_CHECKING:
     from disco_twin.light.sources import HatSource
@@ -60,10 +61,7 @@ class Truth:
 
 def hat_areas(transport: Transport, basis: sparse.csr_matrix) -> F64:
     """(V,) integral over the fine mesh of each scan vertex's hat function, mm^2."""
-    a, b, c = (transport.vertices[transport.faces[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    lumped = np.bincount(transport.faces.ravel(), np.repeat(area / 3, 3), minlength=len(transport.vertices))
-    return np.asarray(basis.T @ lumped)
+    return np.asarray(basis.T @ RayMesh.of(transport.object.mesh).vertex_areas)
 
 
 def truth_columns(

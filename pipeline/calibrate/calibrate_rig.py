@@ -15,7 +15,6 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from hw.base.errors import DiscoError
 from hw.record import Sensor, to_radiance
@@ -36,6 +35,7 @@ from pipeline.calibrate.projector_prior import nominal_projector, with_pose_erro
 from pipeline.calibrate.response import Response
 from pipeline.calibrate.target_images import CameraImages, illumination, intact, measure_response, read_targets
 from pipeline.geometry.camera import turn
+from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.geometry.projector import TwoMirrorProjector
 from pipeline.plan.plan import ImageAddress
@@ -150,7 +150,7 @@ def measure_projector(
 
     nominal: in that frame, place_error: (6, 6) covariance of its pose
     """
-    plan, ray = stream.plan, RayMeshIntersector(mesh)
+    plan, surface = stream.plan, RayMesh.of(mesh)
     found = find_peaks(stream, sensor, plan.lasers // 2)
     bright = brightness(found.peaks, found.power)
     places, normals, eyes, spots, patches, views = [], [], [], [], [], []
@@ -162,22 +162,23 @@ def measure_projector(
         good = seen(peaks, found.power[here], beam_px, bright)
         pixels = np.array([p.pixel for p, g in zip(peaks, good, strict=True) if g]).reshape(-1, 2)
         origin, way = camera.rays(pixels)
-        place, which, face = ray.intersects_location(origin, way, multiple_hits=False)
-        if not len(face):
+        hit = surface.first_hit(origin, way)
+        which = np.flatnonzero(hit.triangle >= 0)
+        if not len(which):
             continue
-        weights = trimesh.triangles.points_to_barycentric(mesh.triangles[face], place)
-        normal = (mesh.vertex_normals[mesh.faces[face]] * weights[:, :, None]).sum(axis=1)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        places.append(place @ back[:3, :3].T + back[:3, 3])
-        normals.append(normal @ back[:3, :3].T)
+        face, weights = hit.triangle[which], hit.barycentric[which]
+        local = surface.points(face, weights)
+        places.append(local @ back[:3, :3].T + back[:3, 3])
+        normals.append(surface.smooth_normals(face, weights) @ back[:3, :3].T)
         eyes.append(-way[which] @ back[:3, :3].T)
         spots.append(found.spot[here][good][which])
         views.append(np.full(len(which), view))
-        cell = np.floor(place / PATCH_MM).astype(np.int64) + 500
+        cell = np.floor(local / PATCH_MM).astype(np.int64) + 500
         patches.append(((plan.angle_of(view) * 1000 + cell[:, 0]) * 1000 + cell[:, 1]) * 1000 + cell[:, 2])
     if not places:
         raise DiscoError("no camera sees any spot. Remedy: check that the laser reaches the object")
-    place, normal, eye, spot = (np.concatenate(x) for x in (places, normals, eyes, spots))
+    place, normal, eye = (np.asarray(np.concatenate(x), np.float64) for x in (places, normals, eyes))
+    spot = np.concatenate(spots)
     steps = np.array([(plan.spots[s].u, plan.spots[s].v) for s in spot], float)
     of_angle = np.array([plan.spots[s].angle for s in spot])
     group = np.unique(np.concatenate(patches), return_inverse=True)[1]

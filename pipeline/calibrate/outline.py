@@ -13,9 +13,9 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage, special
-from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.mesh import RayMesh
 
 F64 = NDArray[np.float64]
 
@@ -140,16 +140,10 @@ def synthetic(mesh: trimesh.Trimesh, camera: PinholeCamera, image: NDArray[np.fl
     """
     s = SUPERSAMPLE
     origins, directions = camera.rays(camera.pixel_centres(s))
-    triangle = RayMeshIntersector(mesh).intersects_first(origins, directions)
-    hit = np.flatnonzero(triangle >= 0)
-    face = triangle[hit]
-    corners, flat = mesh.triangles[face], mesh.face_normals[face]
-    along = ((corners[:, 0] - origins[hit]) * flat).sum(axis=1) / (directions[hit] * flat).sum(axis=1)
-    place = origins[hit] + along[:, None] * directions[hit]
-    weights = np.clip(trimesh.triangles.points_to_barycentric(corners, place), 0, 1)
-    normal = (mesh.vertex_normals[mesh.faces[face]] * weights[:, :, None]).sum(axis=1)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    x, y, z = normal.T
+    surface = RayMesh.of(mesh)
+    found = surface.first_hit(origins, directions)
+    hit = np.flatnonzero(found.triangle >= 0)
+    x, y, z = surface.smooth_normals(found.triangle[hit], found.barycentric[hit]).T
     basis = np.column_stack([np.ones_like(x), x, y, z, x * y, x * z, y * z, x * x - y * y, 3 * z * z - 1])
     rows, columns = np.divmod(hit, camera.width * s)
     pixel = rows // s * camera.width + columns // s

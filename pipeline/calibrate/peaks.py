@@ -9,7 +9,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
-from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+from pipeline.geometry.mesh import RayMesh
 
 F64 = NDArray[np.float64]
 
@@ -77,15 +78,11 @@ def footprint(
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     other = np.cross(ways, side)
     start = np.stack([origins + radius * r * (np.cos(a) * side + np.sin(a) * other) for r, a in rings], axis=1)
-    count = len(rings)
-    flat_place = np.full((len(origins) * count, 3), np.nan)
-    flat_normal = np.zeros_like(flat_place)
-    hit, ray, face = RayMeshIntersector(mesh).intersects_location(
-        start.reshape(-1, 3), np.repeat(ways, count, axis=0), multiple_hits=False
-    )
-    flat_place[ray], flat_normal[ray] = hit, mesh.face_normals[face]
-    place, normal = flat_place.reshape(-1, count, 3), flat_normal.reshape(-1, count, 3)
-    good = np.isfinite(place).all(axis=(1, 2))
+    surface, count = RayMesh.of(mesh), len(rings)
+    hit = surface.first_hit(start.reshape(-1, 3), np.repeat(ways, count, axis=0))
+    place = surface.points(hit.triangle, hit.barycentric).reshape(-1, count, 3)
+    normal = surface.normals[hit.triangle].reshape(-1, count, 3)
+    good = np.asarray((hit.triangle >= 0).reshape(-1, count).all(axis=1))
     weight = np.maximum(np.einsum("nkd,nd->nk", normal, eyes), 0.0) + 1e-12
     centroid = (weight[..., None] * place).sum(axis=1) / weight.sum(axis=1, keepdims=True)
     off, flat = centroid - place[:, 0], normal[:, 0]

@@ -10,7 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.geometry.mesh import Facets
+from pipeline.geometry.mesh import RayMesh
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -48,16 +48,16 @@ def window(mesh: trimesh.Trimesh, camera: PinholeCamera) -> tuple[slice, slice]:
 
 def trace_pixels(mesh: trimesh.Trimesh, camera: PinholeCamera, supersample: int) -> Iterator[SurfaceHits]:
     """What supersample^2 rays a pixel meet, some whole rows of pixels at a time, from the top."""
-    facets, s = Facets.of(mesh), supersample
+    surface, s = RayMesh.of(mesh), supersample
     rows, columns = window(mesh, camera)
     column = np.arange(columns.start * s, columns.stop * s)
     for first in range(rows.start, rows.stop, BAND):
         row = np.arange(first * s, min(first + BAND, rows.stop) * s)
         centres = np.stack(np.meshgrid((column + 0.5) / s, (row + 0.5) / s), axis=-1).reshape(-1, 2)
         origins, directions = camera.rays(centres)
-        hit = facets.first_hit(origins, directions)
+        hit = surface.first_hit(origins, directions)
         index = np.flatnonzero(hit.triangle >= 0)
         triangle, barycentric, direction = hit.triangle[index], hit.barycentric[index], directions[index]
-        cosine = -np.einsum("ni,ni->n", facets.normals(triangle, barycentric), direction)
+        cosine = -np.einsum("ni,ni->n", surface.smooth_normals(triangle, barycentric), direction)
         pixel = row[index // len(column)] // s * camera.width + column[index % len(column)] // s
         yield SurfaceHits(pixel, triangle, barycentric, direction, hit.distance[index], cosine)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from pipeline.geometry.mesh import vertex_areas
+from pipeline.geometry.mesh import RayMesh
 from pipeline.model.term import F32, Axes, Term
 from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 
@@ -20,4 +20,4 @@ class LambertianTerm(Term):
 
     def image(self, light: LightOnMesh, view: ViewOfMesh) -> F32:
         """Radiosity albedo * flux / area, linear on the faces."""
-        return view.image(light.flux * self.albedo / vertex_areas(light.mesh))
+        return view.image(light.flux * self.albedo / RayMesh.of(light.mesh).vertex_areas)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.calibrate.calibration import Calibration
-from pipeline.geometry.mesh import vertex_areas
+from pipeline.geometry.mesh import RayMesh
 from pipeline.reconstruct.global_term.radial_profile import Measured
 from pipeline.reconstruct.samples.samples import Samples
 
@@ -32,7 +32,7 @@ def share_within_an_edge(samples: Samples) -> float:
     """Share of the observed light that leaves within one edge and the beam's radius of its spot."""
     edge = float(samples.mesh.edges_unique_length.mean())
     near = samples.spot_pairs.distance < edge + samples.spots.beam_radius
-    area = vertex_areas(samples.mesh)
+    area = RayMesh.of(samples.mesh).vertex_areas
     power = np.stack([Measured.of(samples, k).value * area for k in range(len(samples.values))])
     return float(power[:, near].sum() / max(power.sum(), 1e-30))
 

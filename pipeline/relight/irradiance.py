@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse import linalg as sparse_linalg
 
 from pipeline.geometry.fresnel import Boundary, transmittance
-from pipeline.geometry.mesh import vertex_areas
-from pipeline.geometry.shadowing import F64, Int, Surface
+from pipeline.geometry.mesh import F64, I64, RayMesh
 from pipeline.relight.incident_light import colour, finest_mm, from_many_directions, from_one_direction
 from pipeline.relight.lights import Environment, Light, Uniform
 
@@ -52,7 +51,7 @@ class Accuracy:
 
 
 def received(
-    surface: Surface, light: Light, face: Int, points: F64, eta: float | Boundary, lasers: int, directions: int = 256
+    surface: RayMesh, light: Light, face: I64, points: F64, eta: float | Boundary, lasers: int, directions: int = 256
 ) -> NDArray[np.float64]:
     """(L, N) transmitted flux density T in W/mm^2 at (N, 3) points on (N,) faces. eta = 1: the plain irradiance."""
     if isinstance(light, Uniform | Environment):
@@ -66,9 +65,9 @@ def received(
 
 
 def _received_from_many(
-    surface: Surface,
+    surface: RayMesh,
     light: Uniform | Environment,
-    face: Int,
+    face: I64,
     points: F64,
     eta: float | Boundary,
     lasers: int,
@@ -90,12 +89,12 @@ def _received_from_many(
     return total
 
 
-def irradiance(light: Light, mesh: trimesh.Trimesh, face: Int, points: F64, lasers: int) -> NDArray[np.float64]:
+def irradiance(light: Light, mesh: trimesh.Trimesh, face: I64, points: F64, lasers: int) -> NDArray[np.float64]:
     """(L, N) plain irradiance in W/mm^2 at (N, 3) points on (N,) faces: no boundary, shadows of the mesh included."""
-    return received(Surface.of(mesh), light, face, points, 1.0, lasers, directions=1024)
+    return received(RayMesh.of(mesh), light, face, points, 1.0, lasers, directions=1024)
 
 
-def _first_cells(surface: Surface, light: Light) -> tuple[Int, F64]:
+def _first_cells(surface: RayMesh, light: Light) -> tuple[I64, F64]:
     """Cells (C,) faces and (C, 3, 3) corners in barycentric coordinates, fine enough that no structure is missed."""
     longest = surface.size / (12 if isinstance(light, Uniform | Environment) else 40)
     face, bary = np.arange(len(surface.faces)), np.broadcast_to(np.eye(3), (len(surface.faces), 3, 3))
@@ -110,13 +109,13 @@ def _first_cells(surface: Surface, light: Light) -> tuple[Int, F64]:
     return np.concatenate(faces), np.concatenate(corners)
 
 
-def _split(face: Int, bary: F64) -> tuple[Int, F64]:
+def _split(face: I64, bary: F64) -> tuple[I64, F64]:
     """Cells -> four children each, the children of a cell next to each other."""
     return np.repeat(face, 4), np.einsum("kij,cjb->ckib", _HALVES, bary).reshape(-1, 3, 3)
 
 
 def _moments(
-    surface: Surface, light: Light, face: Int, bary: F64, eta: float | Boundary, lasers: int, directions: int
+    surface: RayMesh, light: Light, face: I64, bary: F64, eta: float | Boundary, lasers: int, directions: int
 ) -> NDArray[np.float64]:
     """(L, C, 3) integrals of T times the face's three hat functions over each cell, in W."""
     at = np.einsum("pj,cjb->cpb", _RULE, bary)  # (C, 3 points, 3)
@@ -132,11 +131,11 @@ def hat_moments(
 ) -> NDArray[np.float64]:
     """(L, V) integrals of hat_u T dA in W; they add up to all the flux that passes the boundary."""
     accuracy = accuracy or Accuracy()
-    surface = Surface.of(mesh)
+    surface = RayMesh.of(mesh)
     face, bary = _first_cells(surface, light)
     total = np.zeros((lasers, surface.vertices))
 
-    def add(owner: Int, part: F64) -> None:
+    def add(owner: I64, part: F64) -> None:
         for laser in range(lasers):
             total[laser] += np.bincount(surface.faces[owner].ravel(), part[laser].ravel(), surface.vertices)
 
@@ -169,6 +168,6 @@ def transmitted_flux(
     docs/decisions/0005-flux-projection.md for why.
     """
     moments = hat_moments(light, mesh, eta, lasers, accuracy)
-    surface = Surface.of(mesh)
-    density = sparse_linalg.spsolve(surface.mass_matrix(), moments.T).reshape(surface.vertices, lasers)
-    return np.asarray((density * vertex_areas(surface.mesh)[:, None]).T)
+    surface = RayMesh.of(mesh)
+    density = sparse_linalg.spsolve(surface.mass_matrix, moments.T).reshape(surface.vertices, lasers)
+    return np.asarray((density * surface.vertex_areas[:, None]).T)

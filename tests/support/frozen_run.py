@@ -20,7 +20,7 @@ from hw.base.config import read_json
 from hw.base.files import write_json
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import Boundary
-from pipeline.geometry.mesh import vertex_areas
+from pipeline.geometry.mesh import RayMesh
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.samples.distances import vertex_pairs
@@ -69,7 +69,9 @@ def write_frozen_run(root: Path) -> np.ndarray:
     exact = 0.5 * (exact + exact.transpose(0, 2, 1))
     balance = EnergyBalance(**{name: np.ones(2) for name in EnergyBalance.__dataclass_fields__})
     error = 0.01 * exact[:, columns]
-    Truth(columns, exact[:, columns], error, vertex_areas(experiment.scan), balance).save(folder.twin / "truth.npz")
+    Truth(columns, exact[:, columns], error, RayMesh.of(experiment.scan).vertex_areas, balance).save(
+        folder.twin / "truth.npz"
+    )
     term = GlobalTerm(exact.astype(np.float32), np.ones(exact.shape[1:], bool))
     model, noise = RelightableModel(experiment.scan, Boundary(1.3), (term,)), np.random.default_rng(1)
     for light in scene.relight.lights:

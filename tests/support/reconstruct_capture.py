@@ -10,7 +10,7 @@ import trimesh
 from hw.record import RawImage, Sensor
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
 from pipeline.geometry.fresnel import transmittance
-from pipeline.geometry.mesh import first_hit
+from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.nominal_rig import CameraConfig, LaserConfig, ProjectorConfig, RigConfig, SensorConfig
 from pipeline.plan.plan import ImageAddress, Plan, make_plan
 from pipeline.records import NominalRigFile, SensorFile
@@ -92,5 +92,5 @@ def write_capture(folder: Path, subdivisions: int = 2, scan: trimesh.Trimesh | N
     mesh.export(folder / "scan.ply")
     (folder / "rig.json").write_text(NominalRigFile(format_version=1, rig=config).model_dump_json())
     (folder / "sensor.json").write_text(SensorFile(format_version=1, sensor=SENSOR).model_dump_json())
-    assert (first_hit(mesh, *calibration.spot_rays(plan.spots)).triangle >= 0).all()
+    assert (RayMesh.of(mesh).first_hit(*calibration.spot_rays(plan.spots)).triangle >= 0).all()
     return mesh

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from pipeline.geometry.mesh import interpolated_normals, interpolation
+from pipeline.geometry.mesh import RayMesh
 from pipeline.reconstruct.samples.distances import vertex_pairs
 from pipeline.reconstruct.samples.samples import Samples
 from pipeline.reconstruct.samples.spots import Spots
@@ -44,10 +44,10 @@ def make(
     log_a = contrast * np.sin(points[:, 0] / 4.0 + 1.0) * np.cos(points[:, 2] / 5.0)
     triangle = rng.permutation(len(mesh.faces))[:spots]
     barycentric = rng.dirichlet(np.ones(3), spots)
-    position = (mesh.triangles[triangle] * barycentric[:, :, None]).sum(axis=1)
-    normal = interpolated_normals(mesh, triangle, barycentric)
+    surface = RayMesh.of(mesh)
+    position, normal = surface.points(triangle, barycentric), surface.smooth_normals(triangle, barycentric)
     where = Spots(position, -normal, normal, triangle, barycentric, np.full(spots, 0.98), 1.0)
-    to_spots = interpolation(mesh, triangle, barycentric)
+    to_spots = surface.interpolation(triangle, barycentric)
     empty = np.full((lasers, spots, len(points)), np.nan, np.float32)
     level = np.zeros((spots, len(points)))
     bare = Samples(mesh, 1.3, where, empty, empty, empty, level.astype(np.float32), level)

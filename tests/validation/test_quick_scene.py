@@ -11,7 +11,7 @@ from disco_twin.experiment.experiment import Experiment
 from disco_twin.light.sources import BeamSource
 from disco_twin.light.transport import Transport
 from disco_twin.scene.scene import load_scene
-from pipeline.geometry.mesh import vertex_areas
+from pipeline.geometry.mesh import RayMesh
 
 SPOTS, WALKS = 64, 20_000
 
@@ -26,7 +26,7 @@ def test_a_fifth_of_the_light_leaves_beyond_three_edges(repository: Path) -> Non
     """
     world = Experiment(load_scene(repository / "scenes" / "quick.toml", faults=False))
     mesh, edge = world.object.mesh, float(world.scan.edges_unique_length.mean())
-    area = vertex_areas(mesh)
+    area = RayMesh.of(mesh).vertex_areas
     at = np.random.default_rng(0).choice(len(area), SPOTS, replace=False, p=area / area.sum())
     place, normal = np.asarray(mesh.vertices)[at], np.asarray(mesh.vertex_normals)[at]
     transport = Transport(world.object)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from pipeline.geometry.fresnel import Boundary
-from pipeline.geometry.mesh import vertex_areas
+from pipeline.geometry.mesh import RayMesh
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.completion import measured_entries
@@ -49,7 +49,7 @@ def fit_dipole_laser(samples: Samples, laser: int) -> tuple[float, float]:
     pairs, (measured, _) = samples.spot_pairs, over_directions(samples, laser)
     edge = float(samples.mesh.edges_unique_length.mean())
     bin_of = np.minimum((pairs.distance / (0.5 * edge)).astype(int), BINS)
-    area = np.broadcast_to(vertex_areas(samples.mesh), bin_of.shape)
+    area = np.broadcast_to(RayMesh.of(samples.mesh).vertex_areas, bin_of.shape)
 
     def totals(values: F64) -> F64:
         """Power per bin over the observed entries."""

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.fresnel import Boundary
-from pipeline.geometry.mesh import interpolation, vertex_areas
+from pipeline.geometry.mesh import RayMesh
 from pipeline.model.lambertian import LambertianTerm
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.completion import MOST_HARMONICS, RANGE_EDGES
@@ -27,7 +27,7 @@ def spot_energies(samples: Samples, laser: int) -> F64:
     """
     measured, profile = over_directions(samples, laser)
     kernel = samples.spot_pairs.mean(profile)
-    area = vertex_areas(samples.mesh)
+    area = RayMesh.of(samples.mesh).vertex_areas
     expected = (np.where(measured.observed, kernel, 0.0) * area).sum(axis=1)
     seen = (measured.value * area).sum(axis=1)
     whole = (kernel * area).sum(axis=1)
@@ -41,7 +41,7 @@ def fit_lambertian(samples: Samples) -> RelightableModel:
     """
     edge = float(samples.mesh.edges_unique_length.mean())
     covariance = harmonics(samples.mesh, MOST_HARMONICS).covariance(RANGE_EDGES * edge)
-    to_spots = interpolation(samples.mesh, samples.spots.triangle, samples.spots.barycentric)
+    to_spots = RayMesh.of(samples.mesh).interpolation(samples.spots.triangle, samples.spots.barycentric)
     albedos = []
     for laser in range(len(samples.values)):
         energy = spot_energies(samples, laser)

@@ -15,7 +15,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.geometry.fresnel import Boundary, transmittance
-from pipeline.geometry.mesh import interpolation
+from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.pixel_footprints import trace_pixels
 from pipeline.reconstruct.samples.samples import SpotSumImage
 
@@ -39,7 +39,7 @@ def _accumulate(mesh: trimesh.Trimesh, view: SpotSumImage, radiosity: F64, eta: 
         use = np.flatnonzero(whole & (band.cosine > 0))
         cosine = band.cosine[use]
         at = np.minimum(np.searchsorted(EDGES, cosine, side="right") - 1, bins - 1)
-        model = (interpolation(mesh, band.triangle[use], band.barycentric[use]) @ radiosity.T).sum(axis=1)
+        model = (RayMesh.of(mesh).interpolation(band.triangle[use], band.barycentric[use]) @ radiosity.T).sum(axis=1)
         observed += np.bincount(at, image[:, band.pixel[use]].sum(axis=0), bins)
         expected += np.bincount(at, transmittance(cosine, eta) * model, bins)
     return observed, expected

@@ -9,7 +9,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from pipeline.geometry.mesh import stiffness, vertex_areas
+from pipeline.geometry.mesh import RayMesh
 
 F64 = NDArray[np.float64]
 
@@ -33,9 +33,10 @@ class Harmonics:
 
 def harmonics(mesh: trimesh.Trimesh, most: int) -> Harmonics:
     """The smoothest `most` eigenfunctions (all of them on smaller meshes), with lumped masses."""
-    area = vertex_areas(mesh)
+    surface = RayMesh.of(mesh)
+    area = surface.vertex_areas
     scale = 1.0 / np.sqrt(area)
-    matrix = scale[:, None] * stiffness(mesh).toarray() * scale
+    matrix = scale[:, None] * surface.stiffness.toarray() * scale
     count = min(most, len(area))
     values, vectors = eigh(matrix, subset_by_index=(0, count - 1))
     functions = vectors * scale[:, None] * np.sqrt(area.sum())

@@ -18,7 +18,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from pipeline.geometry.mesh import first_hit, interpolation, vertex_areas
+from pipeline.geometry.mesh import RayMesh
 from pipeline.reconstruct.samples.spots import Spots
 
 F64 = NDArray[np.float64]
@@ -80,7 +80,7 @@ def hat_points(mesh: trimesh.Trimesh, n: int) -> HatPoints:
     points = np.einsum("qk,fkx->fqx", local, np.asarray(mesh.triangles)).reshape(-1, 3)
     vertices = np.repeat(np.asarray(mesh.faces, np.int64), len(local), axis=0)
     area = np.repeat(np.asarray(mesh.area_faces, np.float64) / len(local), len(local))
-    weights = np.tile(local, (len(mesh.faces), 1)) * area[:, None] / vertex_areas(mesh)[vertices]
+    weights = np.tile(local, (len(mesh.faces), 1)) * area[:, None] / RayMesh.of(mesh).vertex_areas[vertices]
     return HatPoints(points, vertices, weights)
 
 
@@ -108,13 +108,13 @@ def beam_footprints(mesh: trimesh.Trimesh, spots: Spots) -> sparse.csr_array:
     count = points.shape[1]
     direction = np.repeat(spots.direction, count, axis=0)
     back = 4.0 * float(np.linalg.norm(mesh.extents))
-    hit = first_hit(mesh, points.reshape(-1, 3) - back * direction, direction)
+    hit = RayMesh.of(mesh).first_hit(points.reshape(-1, 3) - back * direction, direction)
     missed = np.flatnonzero(hit.triangle < 0) // count
     hit.triangle[hit.triangle < 0] = spots.triangle[missed]
     hit.barycentric[hit.barycentric.sum(axis=1) == 0] = spots.barycentric[missed]
     spot = np.repeat(np.arange(len(points)), count)
     mean = sparse.csr_array((np.full(len(spot), 1.0 / count), (spot, np.arange(len(spot)))))
-    return sparse.csr_array(mean @ interpolation(mesh, hit.triangle, hit.barycentric))
+    return sparse.csr_array(mean @ RayMesh.of(mesh).interpolation(hit.triangle, hit.barycentric))
 
 
 def _pairs(mesh: trimesh.Trimesh, centres: F64, patches: list[tuple[F64, F64]], spread: float) -> Pairs:

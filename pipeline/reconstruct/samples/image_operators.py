@@ -17,7 +17,7 @@ from scipy import ndimage, sparse
 
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import transmittance
-from pipeline.geometry.mesh import first_hit, vertex_areas
+from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.pixel_footprints import SurfaceHits, trace_pixels
 
 F64 = NDArray[np.float64]
@@ -78,7 +78,7 @@ def see_surface(mesh: trimesh.Trimesh, camera: PinholeCamera, max_view_deg: floa
 
 def _area(mesh: trimesh.Trimesh, camera: PinholeCamera, seen: SurfaceHits) -> tuple[F64, F64]:
     """(N,) mm^2 of surface that each sample stands for, and its cosine with the triangle itself."""
-    flat = -np.einsum("ni,ni->n", mesh.face_normals[seen.triangle], seen.direction)
+    flat = -np.einsum("ni,ni->n", RayMesh.of(mesh).normals[seen.triangle], seen.direction)
     # A pinhole's solid angle per sample; distortion changes it by less than the scan's own errors.
     forward = seen.direction @ camera.pose[2, :3]
     pixels = camera.focal.prod() * SUPERSAMPLE**2
@@ -95,7 +95,7 @@ def footprint_reading(mesh: trimesh.Trimesh, camera: PinholeCamera, eta: float, 
     cosine = np.bincount(vertex, (weight * seen.cosine[:, None]).ravel(), minlength=size[0])
     value = (weight / transmittance(seen.cosine, eta)[:, None]).ravel() / area[vertex].clip(1e-12)
     operator = sparse.coo_array((value, (vertex, pixel)), shape=size).tocsr()
-    share = np.minimum(area / vertex_areas(mesh), 1.0)
+    share = np.minimum(area / RayMesh.of(mesh).vertex_areas, 1.0)
     return ImageOperator(operator, share, cosine / area.clip(1e-12))
 
 
@@ -123,14 +123,14 @@ def image_points(mesh: trimesh.Trimesh, camera: PinholeCamera, points: F64, norm
     visible = inside & (cosine > 0)
     some = np.flatnonzero(visible)
     lifted = points[some] + lift[some, None] * normals[some]
-    visible[some] = first_hit(mesh, lifted, to_camera[some]).triangle < 0
+    visible[some] = RayMesh.of(mesh).first_hit(lifted, to_camera[some]).triangle < 0
     return ImagePoints(pixel, cosine, visible)
 
 
 def bilinear_reading(mesh: trimesh.Trimesh, camera: PinholeCamera, eta: float, max_view_deg: float) -> ImageOperator:
     """Each vertex by one bilinear look-up at its projection (thesis 5.3.1)."""
     vertices, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
-    found = image_points(mesh, camera, vertices, normals, 1e-3 * np.sqrt(vertex_areas(mesh)))
+    found = image_points(mesh, camera, vertices, normals, 1e-3 * np.sqrt(RayMesh.of(mesh).vertex_areas))
     cosine = found.cosine
     seen = np.flatnonzero(found.visible & (cosine > np.cos(np.deg2rad(max_view_deg))))
     corner = np.zeros((len(vertices), 2), np.int64)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.calibrate.calibration import Calibration
 from pipeline.geometry.fresnel import transmittance
-from pipeline.geometry.mesh import first_hit, interpolated_normals
+from pipeline.geometry.mesh import RayMesh
 from pipeline.plan.plan import Plan
 from pipeline.reconstruct.settings import ReconstructConfig
 
@@ -37,13 +37,14 @@ class Spots:
 def locate_spots(mesh: trimesh.Trimesh, calibration: Calibration, plan: Plan, settings: ReconstructConfig) -> Spots:
     """Meet the calibrated beam axes with the scan."""
     origins, direction = calibration.spot_rays(plan.spots)
-    hit = first_hit(mesh, origins, direction)
+    surface = RayMesh.of(mesh)
+    hit = surface.first_hit(origins, direction)
     triangle = np.maximum(hit.triangle, 0)
     barycentric = np.where(hit.triangle[:, None] >= 0, hit.barycentric, 1.0 / 3.0)
-    normal = interpolated_normals(mesh, triangle, barycentric)
+    normal = surface.smooth_normals(triangle, barycentric)
     cosine = -(normal * direction).sum(axis=1)
     used = (hit.triangle >= 0) & (cosine > np.cos(np.deg2rad(settings.max_incidence_deg)))
-    position = (mesh.triangles[triangle] * barycentric[:, :, None]).sum(axis=1)
+    position = surface.points(triangle, barycentric)
     transmitted = np.where(used, transmittance(cosine, settings.eta), 0.0)
     radius = calibration.projectors[0].beam_diameter_mm / 2
     return Spots(position, direction, normal, triangle, barycentric, transmitted, radius)

@@ -15,7 +15,7 @@ from reconstruct_capture import ETA, RADIUS, SENSOR, reflectance, rig, write_cap
 from hw.base.errors import InputError
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
 from pipeline.geometry.fresnel import transmittance
-from pipeline.geometry.mesh import vertex_areas
+from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.scan import read_scan
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.boundary_fit import measure_boundary
@@ -150,7 +150,7 @@ def test_the_model_relights_the_sphere(result) -> None:  # type: ignore[no-untyp
     """Rationale: under uniform light the radiosity of a sphere is pi Tbar L times the integral of R_d, everywhere."""
     work, _ = result
     model = RelightableModel.load(work / "model-default.npz")
-    area = vertex_areas(model.mesh)
+    area = RayMesh.of(model.mesh).vertex_areas
     theta = np.linspace(0, np.pi, 4001)
     ring = 2 * np.pi * RADIUS**2 * np.sin(theta)
     for laser in range(2):

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.geometry.mesh import first_hit, interpolated_normals, stiffness, vertex_areas
+from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.nominal_rig import CameraConfig
 from pipeline.geometry.pixel_footprints import trace_pixels, window
 from pipeline.reconstruct.global_term.harmonics import harmonics
@@ -36,7 +36,7 @@ def middle_of(mesh: trimesh.Trimesh) -> int:
 
 def one_spot(mesh: trimesh.Trimesh, radius: float, tilt_deg: float = 0.0) -> Spots:
     at = mesh.vertices[[middle_of(mesh)]] + [[1e-3, 2e-3, 0]]
-    hit = first_hit(mesh, np.add(at, [[0, 0, 5.0]]), np.array([[0, 0, -1.0]]))
+    hit = RayMesh.of(mesh).first_hit(np.add(at, [[0, 0, 5.0]]), np.array([[0, 0, -1.0]]))
     tilt = np.deg2rad(tilt_deg)
     direction = np.array([[np.sin(tilt), 0.0, -np.cos(tilt)]])
     return Spots(at, direction, np.array([[0, 0, 1.0]]), hit.triangle, hit.barycentric, np.ones(1), radius)
@@ -44,7 +44,7 @@ def one_spot(mesh: trimesh.Trimesh, radius: float, tilt_deg: float = 0.0) -> Spo
 
 def test_rays_hit_where_they_should() -> None:
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=5.0)
-    hit = first_hit(mesh, np.array([[20.0, 0, 0], [20, 9, 0]]), np.array([[-1.0, 0, 0], [-1, 0, 0]]))
+    hit = RayMesh.of(mesh).first_hit(np.array([[20.0, 0, 0], [20, 9, 0]]), np.array([[-1.0, 0, 0], [-1, 0, 0]]))
     assert hit.triangle[0] >= 0
     assert hit.triangle[1] == -1
     assert hit.distance[0] == pytest.approx(15.0, abs=0.05)
@@ -55,7 +55,7 @@ def test_stiffness_integrates_the_gradient() -> None:
     """Rationale: for a linear function, u K u is |grad u|^2 times the area, exactly."""
     mesh = plane()
     u = np.asarray(mesh.vertices) @ [2.0, -1.0, 0.0]
-    assert u @ (stiffness(mesh) @ u) == pytest.approx(5.0 * mesh.area, rel=1e-12)
+    assert u @ (RayMesh.of(mesh).stiffness @ u) == pytest.approx(5.0 * mesh.area, rel=1e-12)
 
 
 def test_harmonics_of_the_sphere() -> None:
@@ -75,7 +75,7 @@ def test_hat_weights_average_exactly() -> None:
 def test_averaging_conserves_energy(length: float) -> None:
     """Rationale: the integral of a kernel over the plane is the same whatever it is averaged over."""
     mesh = plane(28)
-    area = vertex_areas(mesh)
+    area = RayMesh.of(mesh).vertex_areas
 
     def kernel(d):  # type: ignore[no-untyped-def]
         return np.exp(-d / length) / (2 * np.pi * length**2)
@@ -151,7 +151,7 @@ def test_area_that_a_wide_angle_sees_is_the_surface_s() -> None:
     area = np.bincount(
         pixels.vertices.ravel(), (pixels.area[:, None] * pixels.barycentric).ravel(), len(plate.vertices)
     )
-    np.testing.assert_allclose(area[inside], vertex_areas(plate)[inside], rtol=0.05)
+    np.testing.assert_allclose(area[inside], RayMesh.of(plate).vertex_areas[inside], rtol=0.05)
     assert (reading.share[inside] > 0.95).all()
 
 
@@ -230,7 +230,7 @@ def test_every_ray_that_meets_the_surface_is_seen_once(aside_px: float) -> None:
     camera = wide_camera((0.0, -200.0, 0.0), 38.0)
     camera = replace(camera, centre=camera.centre + aside_px)
     origins, directions = camera.rays(camera.pixel_centres(3))
-    hit = first_hit(scan, origins, directions)
+    hit = RayMesh.of(scan).first_hit(origins, directions)
     rows, columns = np.divmod(np.flatnonzero(hit.triangle >= 0), 3 * camera.width)
     order = np.flatnonzero(hit.triangle >= 0)
     bands = list(trace_pixels(scan, camera, 3))
@@ -238,7 +238,7 @@ def test_every_ray_that_meets_the_surface_is_seen_once(aside_px: float) -> None:
     np.testing.assert_array_equal(np.concatenate([b.pixel for b in bands]), rows // 3 * camera.width + columns // 3)
     np.testing.assert_array_equal(np.concatenate([b.triangle for b in bands]), hit.triangle[order])
     np.testing.assert_allclose(np.concatenate([b.distance for b in bands]), hit.distance[order])
-    normals = interpolated_normals(scan, hit.triangle[order], hit.barycentric[order])
+    normals = RayMesh.of(scan).smooth_normals(hit.triangle[order], hit.barycentric[order])
     cosine = -(normals * directions[order]).sum(axis=1)
     np.testing.assert_allclose(np.concatenate([b.cosine for b in bands]), cosine, atol=1e-12)
 

@@ -12,7 +12,7 @@ import trimesh
 from hw.base.errors import InputError
 from pipeline.geometry.camera import PinholeCamera, look_at
 from pipeline.geometry.fresnel import Boundary
-from pipeline.geometry.mesh import vertex_areas
+from pipeline.geometry.mesh import RayMesh
 from pipeline.model.lambertian import LambertianTerm
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
@@ -68,7 +68,7 @@ def test_a_lambertian_surface_is_a_diagonal_matrix() -> None:
     term = opaque()
     diagonal = np.zeros((2, V, V), np.float32)
     for laser in range(2):
-        np.fill_diagonal(diagonal[laser], term.albedo[laser] / vertex_areas(MESH))
+        np.fill_diagonal(diagonal[laser], term.albedo[laser] / RayMesh.of(MESH).vertex_areas)
     one, other = picture(model(term)), picture(model(GlobalTerm(diagonal, diagonal[0] > 0)))
     np.testing.assert_allclose(one, other, atol=1e-6 * other.max())
     assert other.max() > 0

@@ -10,7 +10,7 @@ import pytest
 from reconstruct_synthetic import Synthetic, make, rmse_log10
 
 from pipeline.geometry.fresnel import Boundary
-from pipeline.geometry.mesh import vertex_areas
+from pipeline.geometry.mesh import RayMesh
 from pipeline.reconstruct.global_term import completion
 from pipeline.reconstruct.global_term.completion import (
     RANGE_EDGES,
@@ -65,7 +65,7 @@ def test_completes_what_was_not_measured(small: Synthetic) -> None:
     assert 0.3 < model.measured.mean() < 0.95
     for part in (model.measured, ~model.measured):
         assert rmse_log10(r[part], small.truth[0][part]) < 0.06
-    area = vertex_areas(small.samples.mesh)
+    area = RayMesh.of(small.samples.mesh).vertex_areas
     ratio = (r @ area) / (small.truth[0] @ area)
     assert abs(ratio.mean() - 1) < 0.02
     assert ratio.std() < 0.06

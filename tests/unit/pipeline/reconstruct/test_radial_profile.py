@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from reconstruct_synthetic import Synthetic, make, rmse_log10
 
-from pipeline.geometry.mesh import vertex_areas
+from pipeline.geometry.mesh import RayMesh
 from pipeline.reconstruct.baselines.dipole import dipole_reflectance, fit_dipole, fit_dipole_laser
 from pipeline.reconstruct.baselines.lambertian import fit_lambertian
 from pipeline.reconstruct.global_term.completion import (
@@ -60,7 +60,7 @@ def test_dipole_model_depends_on_distance_alone(small: Synthetic) -> None:
 
 def test_lambertian_albedo_is_the_energy_of_the_spots(small: Synthetic) -> None:
     (term,) = fit_lambertian(small.samples).terms
-    area = vertex_areas(small.samples.mesh)
+    area = RayMesh.of(small.samples.mesh).vertex_areas
     albedo = term.albedo[0]
     truth = small.truth[0] @ area
     assert np.std(albedo / truth) < 0.08

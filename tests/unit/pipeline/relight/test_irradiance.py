@@ -11,8 +11,7 @@ from scipy.integrate import dblquad
 from hw.base.errors import InputError
 from pipeline.geometry.camera import look_at
 from pipeline.geometry.fresnel import mean_transmittance, transmittance
-from pipeline.geometry.mesh import first_hit, vertex_areas
-from pipeline.geometry.shadowing import Surface
+from pipeline.geometry.mesh import RayMesh
 from pipeline.relight.incident_light import from_many_directions
 from pipeline.relight.irradiance import Accuracy, hat_moments, irradiance, transmitted_flux
 from pipeline.relight.lights import (
@@ -57,7 +56,7 @@ def shelf(lower: float, upper: float, gap: float) -> trimesh.Trimesh:
 def test_uniform_light_on_a_convex_body_is_pi_l_tbar() -> None:
     mesh = ball()
     q = transmitted_flux(Uniform(radiance=2.0, colour=(1, 0.5, 0.25)), mesh, 1.3, 3)
-    area = vertex_areas(mesh)
+    area = RayMesh.of(mesh).vertex_areas
     expected = 2 * np.pi * mean_transmittance(1.3) * np.outer([1, 0.5, 0.25], area)
     np.testing.assert_allclose(q, expected, rtol=1.5e-4)  # 256 directions; F_t is steep at grazing angles
 
@@ -77,7 +76,7 @@ def test_directional_power_is_the_projected_area_and_converges_to_the_disc() -> 
     for subdivisions in (2, 3, 4):
         mesh = ball(subdivisions)
         power = hat_moments(Directional(direction=(1, 2, -3), irradiance=2.0), mesh, 1.0, 1).sum()
-        surface = Surface.of(mesh)
+        surface = RayMesh.of(mesh)
         towards = -np.array([1, 2, -3]) / np.sqrt(14)
         assert power == pytest.approx(2 * (surface.areas * np.maximum(surface.normals @ towards, 0)).sum(), rel=1e-9)
         errors.append(abs(power / (2 * np.pi * 400) - 1))
@@ -124,7 +123,7 @@ def test_projector_power_by_quadrature() -> None:
         return float(1e5 * (1 + wave) / 2 * (z / np.sqrt(r2)) ** 3 / r2 * z / np.sqrt(r2))
 
     slab = trimesh.creation.box(extents=(40, 40, 2), transform=trimesh.transformations.translation_matrix([0, 0, -1]))
-    top = np.flatnonzero(Surface.of(slab).normals[:, 2] > 0.9)
+    top = np.flatnonzero(RayMesh.of(slab).normals[:, 2] > 0.9)
     points = np.array([[2.0, 2.0, 0], [-2, 2.0, 0], [9.5, 0, 0]])
     e = irradiance(light, slab, np.repeat(top[0], 3), points, 1)[0]
     np.testing.assert_allclose(e, [density(2, 2), density(2, -2), 0], rtol=1e-9)
@@ -151,7 +150,7 @@ def test_a_roof_over_a_point_takes_its_form_factor() -> None:
         extents=(60, 60, 1), transform=trimesh.transformations.translation_matrix([0, 0, -0.5])
     )
     mesh = trimesh.util.concatenate([floor, roof])
-    top = np.flatnonzero(Surface.of(mesh).normals[:12, 2] > 0.9)[0]
+    top = np.flatnonzero(RayMesh.of(mesh).normals[:12, 2] > 0.9)[0]
     e = irradiance(Uniform(), mesh, np.array([top]), np.zeros((1, 3)), 1)[0, 0]
     assert e == pytest.approx(np.pi * (1 - 100 / 164), rel=5e-3)
 
@@ -301,14 +300,14 @@ def test_projection_keeps_the_total_and_a_constant_density() -> None:
     light = Directional(direction=(1, 0.3, -0.4))
     moments, q = hat_moments(light, mesh, 1.3, 1), transmitted_flux(light, mesh, 1.3, 1)
     assert q.sum() == pytest.approx(moments.sum(), rel=1e-12)
-    surface = Surface.of(mesh)
-    np.testing.assert_allclose(np.asarray(surface.mass_matrix().sum(axis=1)).ravel(), vertex_areas(surface.mesh))
+    surface = RayMesh.of(mesh)
+    np.testing.assert_allclose(np.asarray(surface.mass_matrix.sum(axis=1)).ravel(), surface.vertex_areas)
     dense = np.zeros((len(mesh.vertices),) * 2)
     for face, area in zip(mesh.faces, mesh.area_faces, strict=True):
         dense[np.ix_(face, face)] += area / 12 * (1 + np.eye(3))  # integrals of products of barycentric coordinates
     np.testing.assert_allclose(q[0], dense.sum(axis=1) * np.linalg.solve(dense, moments[0]), rtol=1e-9, atol=1e-9)
     flat = transmitted_flux(Uniform(), ball(), 1.0, 1)[0]  # density pi everywhere
-    np.testing.assert_allclose(flat, np.pi * vertex_areas(ball()), rtol=1e-10)
+    np.testing.assert_allclose(flat, np.pi * RayMesh.of(ball()).vertex_areas, rtol=1e-10)
 
 
 def test_mass_projection_relights_better_than_hat_weights() -> None:
@@ -317,9 +316,9 @@ def test_mass_projection_relights_better_than_hat_weights() -> None:
     Expected: the mass matrix at least halves the error of a smooth light.
     """
     mesh = ball(2)
-    surface = Surface.of(mesh)
+    surface = RayMesh.of(mesh)
     fine = trimesh.creation.icosphere(subdivisions=4, radius=20).vertices
-    hit = first_hit(surface.mesh, 3 * fine, -fine / 20)
+    hit = surface.first_hit(3 * fine, -fine / 20)
     face, bary = hit.triangle, hit.barycentric
     hats = np.zeros((len(fine), surface.vertices))
     np.put_along_axis(hats, surface.faces[face], bary, axis=1)
