@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 from scipy import special
 
 from hw.base.errors import DiscoError
+from pipeline.calibrate.least_squares import Linearised, Prior, minimise
 from pipeline.geometry.camera import PinholeCamera
 
 F64 = NDArray[np.float64]
 
 # What a lens and its mount keep to, standard deviations: focal length (share), centre (share of the width), k1.
 FOCAL_TOLERANCE, CENTRE_TOLERANCE, K1_TOLERANCE = 0.005, 0.008, 0.08
+LENS = 4  # unknowns: focal length, centre x, y, k1
 LEAST_BOARDS = 6
 WINDOW = 4  # pixels around a corner that its position is fitted to
 PARTS = 4  # of a pixel, per axis, that a corner's model is averaged over
@@ -120,36 +122,83 @@ def _least_squares(design: F64, values: F64) -> F64:
 
 
 def fit_intrinsics(corners: Sequence[F64 | None], board: F64, nominal: PinholeCamera) -> Intrinsics:
-    """Gauss-Newton over the lens and all boards' poses. corners: per image (N, 2) or None; board: (N, 3) mm."""
-    used = [i for i, c in enumerate(corners) if c is not None]
-    if len(used) < LEAST_BOARDS:
+    """The lens and all boards' poses together. corners: per image (N, 2) or None; board: (N, 3) mm.
+
+    The covariance is taken from the boards' scatter where that is larger than the corners': corners of one board err
+    together.
+
+    Raises: DiscoError where fewer than `LEAST_BOARDS` boards were found.
+    """
+    seen = {i: c for i, c in enumerate(corners) if c is not None}
+    if len(seen) < LEAST_BOARDS:
         raise DiscoError(
-            f"the chessboard was found in {len(used)} images, {LEAST_BOARDS} are needed. "
+            f"the chessboard was found in {len(seen)} images, {LEAST_BOARDS} are needed. "
             "Remedy: light it evenly, keep all of it in view"
         )
-    seen = {i: c for i, c in enumerate(corners) if c is not None}
     start = np.array([nominal.focal.mean(), *nominal.centre, nominal.distortion[0]])
-    prior = np.array([FOCAL_TOLERANCE * start[0], *(CENTRE_TOLERANCE * nominal.width,) * 2, K1_TOLERANCE])
-    lens = start.copy()
-    poses = {i: _pose_of(seen[i], board, lens, nominal) for i in used}
-    for round_ in range(12):
-        if round_ == 6:
-            rms = {i: float(np.sqrt((_residual(seen[i], board, lens, poses[i], nominal) ** 2).mean())) for i in used}
-            limit = OUTLIER * float(np.median(list(rms.values())))
-            used = [i for i in used if rms[i] < limit]
-        step, inverse, blocks = _normal_step(used, seen, board, lens, poses, nominal, start, prior)
-        lens = lens + step
-        for i in used:
-            gain, back = blocks[i]
-            poses[i] = poses[i] + gain - back @ step
-    squared = np.concatenate([_residual(seen[i], board, lens, poses[i], nominal) for i in used]) ** 2
+    tolerance = np.array([FOCAL_TOLERANCE * start[0], *(CENTRE_TOLERANCE * nominal.width,) * 2, K1_TOLERANCE])
+    first = np.concatenate([start, *(_pose_of(c, board, start, nominal) for c in seen.values())])
+    every = _Boards(list(seen.values()), board, nominal).fit(first, tolerance, start)
+    rms = np.sqrt((every.residual.reshape(len(seen), -1) ** 2).mean(axis=1))
+    good = np.flatnonzero(rms < OUTLIER * np.median(rms))
+    used = np.array(list(seen))[good]
+    again = np.concatenate([every.value[:LENS], every.value[LENS:].reshape(-1, 6)[good].ravel()])
+    boards = _Boards([seen[i] for i in used], board, nominal)
+    fit = boards.fit(again, tolerance, start)
+    inverse = np.linalg.inv(fit.precision)[:LENS, :LENS]
+    prior = fit.prior.precision[:LENS, :LENS]
+    of_board = np.repeat(np.arange(len(used)), 2 * len(board))
+    meat = fit.scatter(of_board, LENS, about_mean=True)[:LENS, :LENS] + prior
+    scale = np.sqrt(np.maximum(np.diag(inverse @ meat @ inverse) / np.diag(inverse), 1.0))
     return Intrinsics(
-        lens,
-        inverse,
-        float(np.sqrt(2 * squared.mean())),
-        tuple(_matrix(poses[i]) for i in used),
-        tuple(used),
+        fit.value[:LENS],
+        inverse * np.outer(scale, scale),
+        float(np.sqrt(2 * (fit.residual**2).mean())),
+        tuple(_matrix(pose) for pose in fit.value[LENS:].reshape(-1, 6)),
+        tuple(int(i) for i in used),
     )
+
+
+@dataclass(frozen=True)
+class _Boards:
+    """Boards seen by one camera. The unknowns are the lens (`LENS`), then each board's rotation vector and shift."""
+
+    corners: Sequence[F64]
+    board: F64
+    nominal: PinholeCamera
+
+    def residual(self, x: F64) -> F64:
+        """(K,) pixels, predicted less seen, board after board."""
+        return np.concatenate([self._predicted(x, i)[0] - (c - 0.5).ravel() for i, c in enumerate(self.corners)])
+
+    def jacobian(self, x: F64) -> F64:
+        """(K, P), OpenCV's own."""
+        rows = 2 * len(self.board)
+        out = np.zeros((rows * len(self.corners), len(x)))
+        for i in range(len(self.corners)):
+            j, part = self._predicted(x, i)[1], out[i * rows : (i + 1) * rows]
+            part[:, :LENS] = np.column_stack([j[:, 6] + j[:, 7], j[:, 8:11]])
+            part[:, LENS + 6 * i : LENS + 6 * i + 6] = j[:, :6]
+        return out
+
+    def _predicted(self, x: F64, i: int) -> tuple[F64, F64]:
+        pose = x[LENS + 6 * i : LENS + 6 * i + 6]
+        points, j = cv2.projectPoints(self.board, pose[:3], pose[3:], *_matrices(x[:LENS], self.nominal))
+        return points.ravel(), j
+
+    def fit(self, x: F64, tolerance: F64, nominal: F64) -> Linearised:
+        """From a start. The corners' own noise, which the lens's tolerance counts against, is what the fit leaves."""
+        mean, sigma = np.zeros(len(x)), np.full(len(x), np.inf)
+        mean[:LENS] = nominal
+        for _ in range(2):
+            rest = self.residual(x)
+            noise = max(float(np.sqrt(rest @ rest / max(len(rest) - len(x), 1))), 1e-9)
+            sigma[:LENS] = tolerance / noise
+            x = minimise(self.residual, x, Prior.independent(mean, sigma), self.jacobian).value
+        rest = self.residual(x)
+        weight = np.full(len(rest), max(len(rest) - len(x), 1) / max(float(rest @ rest), 1e-18))
+        sigma[:LENS] = tolerance
+        return Linearised(x, rest, self.jacobian(x), weight, Prior.independent(mean, sigma))
 
 
 def _matrices(lens: F64, nominal: PinholeCamera) -> tuple[F64, F64]:
@@ -159,60 +208,12 @@ def _matrices(lens: F64, nominal: PinholeCamera) -> tuple[F64, F64]:
 
 
 def _pose_of(points: F64, board: F64, lens: F64, nominal: PinholeCamera) -> F64:
-    """(6,) rotation vector and translation of a board."""
+    """(6,) rotation vector and translation of a board. Raises: DiscoError where its corners make no plane."""
     matrix, distortion = _matrices(lens, nominal)
     ok, rotation, shift = cv2.solvePnP(board, points - 0.5, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
     if not ok:
         raise DiscoError("a chessboard's pose cannot be found from its corners")
     return np.concatenate([rotation.ravel(), shift.ravel()]).astype(np.float64)
-
-
-def _residual(points: F64, board: F64, lens: F64, pose: F64, nominal: PinholeCamera) -> F64:
-    predicted, _ = cv2.projectPoints(board, pose[:3], pose[3:], *_matrices(lens, nominal))
-    return np.asarray(((points - 0.5) - predicted.reshape(-1, 2)).ravel())
-
-
-def _normal_step(
-    used: Sequence[int],
-    seen: dict[int, F64],
-    board: F64,
-    lens: F64,
-    poses: dict[int, F64],
-    nominal: PinholeCamera,
-    start: F64,
-    prior: F64,
-) -> tuple[F64, F64, dict[int, tuple[F64, F64]]]:
-    """One Gauss-Newton step with the poses eliminated (Schur complement).
-
-    Returns the lens's step, its covariance, and per board (own step, how it follows the lens's). Corners of one board
-    err together: the covariance is taken from the boards' scatter (sandwich estimator) where that is larger.
-    """
-    hessian, gradient = np.zeros((4, 4)), np.zeros(4)
-    blocks, scores, total, freedom = {}, [], 0.0, 0
-    matrix, distortion = _matrices(lens, nominal)
-    for i in used:
-        _, j = cv2.projectPoints(board, poses[i][:3], poses[i][3:], matrix, distortion)
-        own, shared = j[:, :6], np.column_stack([j[:, 6] + j[:, 7], j[:, 8], j[:, 9], j[:, 10]])
-        residual = _residual(seen[i], board, lens, poses[i], nominal)
-        solve = np.linalg.pinv(own)
-        gain, back = solve @ residual, solve @ shared
-        free = shared - own @ back
-        rest = residual - own @ gain
-        blocks[i] = gain, back
-        hessian += free.T @ free
-        score = free.T @ rest
-        scores.append(score)
-        gradient += score
-        total, freedom = total + rest @ rest, freedom + len(rest) - 6
-    variance = total / max(freedom - 4, 1)
-    precise = hessian / variance + np.diag(prior**-2)
-    inverse = np.linalg.inv(precise)
-    step = inverse @ (gradient / variance + (start - lens) / prior**2)
-    spread = np.array(scores) - np.mean(scores, axis=0)
-    meat = spread.T @ spread / variance**2 * len(used) / max(len(used) - 4, 1) + np.diag(prior**-2)
-    sandwich = inverse @ meat @ inverse
-    scale = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0))
-    return step, inverse * np.outer(scale, scale), blocks
 
 
 def board_pose(points: F64, board: F64, lens: PinholeCamera) -> F64:

@@ -18,6 +18,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from hw.base.errors import DiscoError
+from pipeline.calibrate.least_squares import Huber, Linearised, Prior
 from pipeline.calibrate.outline import Outline, edges_along, mesh_mask, object_mask, outline, signed_distance, synthetic
 from pipeline.calibrate.scan_error import surface_error
 from pipeline.geometry.camera import PinholeCamera, turn
@@ -155,19 +156,13 @@ def _lens_rows(sweep: _Sweep) -> NDArray[np.bool_]:
     return rows
 
 
-def _priors(sweep: _Sweep) -> F64:
-    """(P, P) precision of the increments about the starting values; lenses are held."""
-    precision = np.zeros((sweep.size, sweep.size))
-    for c in range(len(sweep.lenses)):
-        at = (6 + LENS) * c
-        sigma = np.array([PLACE_RAD] * 3 + [PLACE_MM] * 3 + [HELD] * LENS)
-        precision[at : at + 6 + LENS, at : at + 6 + LENS] = np.diag(sigma**-2)
+def _prior(sweep: _Sweep, share: float = 1.0) -> Prior:
+    """Of the increments about the starting values, what is known times `share`; lenses are held."""
+    camera = [PLACE_RAD] * 3 + [PLACE_MM] * 3 + [HELD] * LENS
     rest = sweep.size - (6 + LENS) * len(sweep.lenses)
-    if rest:
-        sigma = np.array([AXIS_RAD] * 2 + [AXIS_MM] * 2 + [ANGLE_RAD] * (rest - 4))
-        at = sweep.size - rest
-        precision[at:, at:] = np.diag(sigma**-2)
-    return precision
+    table = [AXIS_RAD] * 2 + [AXIS_MM] * 2 + [ANGLE_RAD] * (rest - 4)
+    sigma = np.array(camera * len(sweep.lenses) + (table if rest else []))
+    return Prior.independent(np.zeros(sweep.size), sigma / share)
 
 
 def fit_poses(
@@ -192,7 +187,7 @@ def fit_poses(
 def _coarse(start: _Sweep, masks: Sequence[NDArray[np.bool_]], mesh: trimesh.Trimesh) -> _Sweep:
     """Down the distance to the silhouettes, from several starts that differ by a few degrees; the best by XOR."""
     distances = [signed_distance(m) for m in masks]
-    precision = _priors(start)
+    prior = _prior(start, 0.1)
     best, fewest = start, np.inf
     for tilt in _STARTS:
         sweep = start
@@ -200,22 +195,18 @@ def _coarse(start: _Sweep, masks: Sequence[NDArray[np.bool_]], mesh: trimesh.Tri
             step = np.zeros(start.size)
             step[(6 + LENS) * c : (6 + LENS) * c + 3] = tilt
             sweep = _centred(sweep.moved(step), c, masks[c * len(start.angles)], mesh, camera)
-        total = np.asarray(np.zeros(start.size))
+        total: F64 = np.zeros(start.size)
         for _ in range(COARSE_STEPS):
-            hessian, gradient = precision * 1e-2, -1e-2 * precision @ total
-            for v, distance in enumerate(distances):
-                rim = outline(mesh, sweep.view(v))
-                if not len(rim.pixel):
-                    continue
-                away = ndimage.map_coordinates(distance, rim.pixel.T[::-1] - 0.5, order=1, mode="nearest")
-                weight = rim.length / np.maximum(np.abs(away) / HUBER_COARSE_PX, 1.0)
-                j = sweep.jacobian(v, rim)
-                hessian = hessian + j.T @ (j * weight[:, None])
-                gradient = gradient - j.T @ (weight * away)
-            damped = hessian + 1e-9 * np.diag(np.diag(hessian))
-            update = np.asarray(np.linalg.solve(damped, gradient), np.float64)
-            sweep, total = sweep.moved(update), np.asarray(total + update)
-            if np.abs(update[:3]).max() < 2e-4:
+            rims = [outline(mesh, sweep.view(v)) for v in range(len(masks))]
+            j = np.concatenate([sweep.jacobian(v, rim) for v, rim in enumerate(rims)])
+            away = np.concatenate([
+                ndimage.map_coordinates(distance, rim.pixel.T[::-1] - 0.5, order=1, mode="nearest")
+                for distance, rim in zip(distances, rims, strict=True)
+            ])
+            weight = np.concatenate([rim.length for rim in rims]) * Huber(HUBER_COARSE_PX).weight(away)
+            step = Linearised(total, away, j, weight, prior).step()
+            sweep, total = sweep.moved(step), total + step
+            if np.abs(step[:3]).max() < 2e-4:
                 break
         wrong = sum(int((mesh_mask(mesh, sweep.view(v)) ^ m).sum()) for v, m in enumerate(masks))
         if wrong < fewest:
@@ -258,10 +249,8 @@ def _fine(
     lens: Sequence[F64],
 ) -> PoseFit:
     """Gauss-Newton on the edges, then the covariance from what the edges leave unexplained, sector by sector."""
-    precision = _priors(sweep)
+    prior = _prior(sweep)
     total: F64 = np.zeros(sweep.size)
-    rows: list[tuple[F64, F64, F64, NDArray[np.int64], F64]] = []
-    variance = 0.05**2
     for last in range(FINE_STEPS):
         rows = [_edges_of(sweep, v, image, mesh, last >= FINE_STEPS - EXACT_STEPS) for v, image in enumerate(images)]
         j, rest, length, sector, place = (np.concatenate([r[k] for r in rows]) for k in range(5))
@@ -270,29 +259,25 @@ def _fine(
                 "the silhouettes show no edge near the scan's outline. Remedy: check that the scan is of this object, "
                 "in mm and in the object's frame"
             )
-        weight = length / np.maximum(np.abs(rest) / HUBER_FINE_PX, 1.0)
+        weight = length * Huber(HUBER_FINE_PX).weight(rest)
         variance = float((weight * rest**2).sum() / weight.sum())
-        hessian = j.T @ (j * weight[:, None]) / variance
-        step = np.linalg.solve(hessian + precision, j.T @ (weight * rest) / variance - precision @ total)
-        sweep, total = sweep.moved(step), np.asarray(total + step)
-    scores = np.zeros((sector.max(initial=0) + 1, sweep.size))
-    np.add.at(scores, sector, j * (weight * (rest - j @ step) / variance)[:, None])
-    scores = scores[np.abs(scores).sum(axis=1) > 0]
-    count = len(scores)
-    inverse = np.linalg.inv(hessian + precision)
-    meat = scores.T @ scores * count / max(count - sweep.size, count / 4)
+        fit = Linearised(total, -rest, j, weight / variance, prior)
+        step = fit.step()
+        sweep, total = sweep.moved(step), total + step
+    fit = replace(fit, residual=j @ step - rest)
+    inverse, meat = np.linalg.inv(fit.precision), fit.scatter(sector)
     for c in range(len(sweep.lenses)):
         common = sector // (SECTORS * len(sweep.angles)) == c
         push = j[common].T @ weight[common] * (COMMON_EDGE_PX / variance)
         meat += np.outer(push, push)
-    surface = surface_error(j, rest - j @ step, weight / variance, length, place, inverse)
+    surface = surface_error(j, -fit.residual, fit.weight, length, place, inverse)
     meat += surface.push
     # Lenses are held where the boards put them, but their errors are passed on (Schmidt's consider covariance).
     held = _lens_rows(sweep)
-    follow = -inverse[:, ~held] @ hessian[np.ix_(~held, held)]
+    follow = -inverse[:, ~held] @ fit.information[np.ix_(~held, held)]
     follow[held] = np.eye(int(held.sum()))
     meat[held], meat[:, held] = 0.0, 0.0
-    image = inverse @ (meat + np.where(held, 0.0, precision)) @ inverse
+    image = inverse @ (meat + np.where(held, 0.0, prior.precision)) @ inverse
     covariance = image + follow @ block_diag(*lens) @ follow.T
     found = _result(sweep, covariance, image, float(np.sqrt(variance)), len(rest), masks, mesh)
     return replace(found, surface_mm=surface.size_mm, surface_alike_mm=surface.alike_mm)

@@ -9,12 +9,14 @@ squares, started from what the rig was built to be.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hw.base.errors import DiscoError
+from pipeline.calibrate.least_squares import Huber, Prior, minimise
 from pipeline.geometry.projector import TwoMirrorProjector
 
 F64 = NDArray[np.float64]
@@ -209,32 +211,27 @@ def refine(
     """
     nominal = start.full_angle_rad
     known = StepSize(nominal, np.diag((nominal * ANGLE_SHARE) ** 2)) if size is None else size
-    precision, target = _known(own_place(start.pose) if place is None else place, known)
-    value = np.concatenate([np.zeros(6), nominal, [0.0, 0.0]])
+    prior = _prior(own_place(start.pose) if place is None else place, known)
     group = np.arange(len(points)) if group is None else group
-    scatter = np.inf
-    weight = np.ones(len(points))
+
+    def misses(unit: float, value: F64) -> F64:
+        return _across(start, value, points, steps, normals, to_eye).ravel() / unit
+
+    value, scatter = np.concatenate([np.zeros(6), nominal, [0.0, 0.0]]), np.inf
+    loss = Huber(HUBER, GATE, width=2)  # of misses in units of their scatter
     for _ in range(STEPS):
-        rest = _across(start, value, points, steps, normals, to_eye)
-        size_of = np.linalg.norm(rest, axis=1)
-        scatter = max(float(np.median(size_of)) / 1.1774, 1e-4)
-        weight = np.where(size_of > GATE * scatter, 0.0, 1.0 / np.maximum(size_of / (HUBER * scatter), 1.0))
-        j = _derivative(start, value, points, steps, normals, to_eye)
-        hessian = np.einsum("n,nkp,nkq->pq", weight, j, j) / scatter**2
-        gradient = -np.einsum("n,nkp,nk->p", weight, j, rest) / scatter**2
-        value = value + np.linalg.solve(hessian + precision, gradient + precision @ (target - value))
-    rest = _across(start, value, points, steps, normals, to_eye)
-    scores = np.zeros((group.max() + 1, len(value)))
-    np.add.at(scores, group, np.einsum("n,nkp,nk->np", weight, j, rest) / scatter**2)
-    scores = scores[np.abs(scores).sum(axis=1) > 0]
-    meat = scores.T @ scores * len(scores) / max(len(scores) - len(value), 1)
-    inverse = np.linalg.inv(hessian + precision)
-    covariance = inverse @ (meat + precision) @ inverse
-    kept = weight > 0
+        before, scatter = scatter, max(float(np.median(loss.size(misses(1.0, value)))) / 1.1774, 1e-4)
+        fit = minimise(partial(misses, scatter), value, prior, loss=loss)
+        value = fit.value
+        if abs(scatter - before) < 1e-4 * scatter:
+            break
+    inverse = np.linalg.inv(fit.precision)
+    covariance = inverse @ (fit.scatter(np.repeat(group, 2)) + prior.precision) @ inverse
+    kept = fit.weight[::2] > 0
     return ProjectorFit(
         _moved(start, value),
         covariance[:8, :8],
-        float(np.sqrt((rest[kept] ** 2).sum(axis=1).mean())) if kept.any() else np.inf,
+        scatter * float(np.sqrt((loss.size(fit.residual)[kept] ** 2).mean())) if kept.any() else np.inf,
         ~kept,
         value[8:],
         np.sqrt(np.diag(covariance)[8:]),
@@ -254,15 +251,15 @@ def own_place(pose: F64) -> F64:
     return np.asarray(out)
 
 
-def _known(place: F64, size: StepSize) -> tuple[F64, F64]:
-    """(10, 10) precision and (10,) mean of the unknowns before any spot is seen."""
+def _prior(place: F64, size: StepSize) -> Prior:
+    """Of the ten unknowns before any spot is seen: pose, full angles, the peak's shift."""
     precision = np.zeros((10, 10))
     precision[:6, :6] = np.linalg.inv(place)
     precision[8:, 8:] = SHIFT_MM**-2 * np.eye(2)
     # A pose that is off by p gives the plane's angles off by -by_pose p.
     rows = np.hstack([-size.by_pose, np.eye(2), np.zeros((2, 2))])
     precision += rows.T @ np.linalg.inv(size.covariance) @ rows
-    return precision, np.concatenate([np.zeros(6), size.full_angle_rad, [0.0, 0.0]])
+    return Prior(np.concatenate([np.zeros(6), size.full_angle_rad, [0.0, 0.0]]), precision)
 
 
 def _moved(start: TwoMirrorProjector, value: F64) -> TwoMirrorProjector:
@@ -287,15 +284,3 @@ def _peak_shift(shift: F64, direction: F64, normals: F64) -> F64:
     """(N, 3) mm."""
     tangential = direction - (direction * normals).sum(axis=1, keepdims=True) * normals
     return np.asarray((shift[0] + shift[1] * (tangential**2).sum(axis=1, keepdims=True)) * tangential)
-
-
-def _derivative(start: TwoMirrorProjector, value: F64, points: F64, steps: F64, normals: F64, to_eye: F64) -> F64:
-    """(N, 2, P) of `_across` by the unknowns, central differences."""
-    columns = []
-    for k in range(len(value)):
-        h = 1e-5 if k < 3 or 6 <= k < 8 else 1e-3
-        step = np.zeros(len(value))
-        step[k] = h
-        ahead, behind = (_across(start, value + s * step, points, steps, normals, to_eye) for s in (1, -1))
-        columns.append((ahead - behind) / (2 * h))
-    return np.stack(columns, axis=2)

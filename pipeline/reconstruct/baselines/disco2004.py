@@ -13,6 +13,7 @@ import logging
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.sparse.linalg import LinearOperator, cg
 
 from pipeline.geometry.fresnel import Boundary
 from pipeline.model.reflectance import GlobalTerm
@@ -68,32 +69,20 @@ def fill(values: F64, known: Bool, laplacian: sparse.csr_array) -> F64:
     count = known.astype(np.float64) + known.T
     fixed = count > 0
     start = np.where(fixed, (values + values.T) / np.maximum(count, 1.0), 0.0)
-    operator, unknown = laplacian.astype(np.float32), (~fixed).astype(np.float32)
+    operator = laplacian.astype(np.float32)
     degree = np.asarray(operator.diagonal())
-    precondition = unknown / (degree[:, None] + degree[None, :])
+    half = (~fixed).astype(np.float32) / np.sqrt(degree[:, None] + degree[None, :])  # 0 where nothing is sought
 
     def apply(entries: NDArray[np.float32]) -> NDArray[np.float32]:
         along = operator @ entries  # entries is symmetric: the same along rows is its transpose
-        return np.asarray(unknown * (along + along.T))
+        return np.asarray(half * (along + along.T))
 
-    out = start.astype(np.float32)
-    residual = -apply(out)
-    z = precondition * residual
-    direction, size = z, float((residual * z).sum(dtype=np.float64))
-    stop = TOLERANCE**2 * size
-    for _ in range(MOST_STEPS):
-        if size <= stop:
-            break
-        image = apply(direction)
-        length = np.float32(size / float((direction * image).sum(dtype=np.float64)))
-        out = out + length * direction
-        residual = residual - length * image
-        z = precondition * residual
-        before, size = size, float((residual * z).sum(dtype=np.float64))
-        direction = z + np.float32(size / before) * direction
-    else:
-        log.warning("disco2004: conjugate gradients stopped after %d steps", MOST_STEPS)
-    return np.asarray(np.where(fixed, start, np.maximum(out, 0.0)), np.float64)
+    size = half.size
+    system = LinearOperator((size, size), lambda x: apply(half * x.reshape(half.shape)).ravel(), dtype=np.float32)
+    filled, steps = cg(system, -apply(start.astype(np.float32)).ravel(), rtol=TOLERANCE, maxiter=MOST_STEPS)
+    if steps:
+        log.warning("disco2004: conjugate gradients stopped after %d steps", steps)
+    return np.asarray(np.where(fixed, start, np.maximum(half * filled.reshape(half.shape), 0.0)), np.float64)
 
 
 @method("disco2004", about="resampling and filling of the thesis (5.3)", reads="bilinear", colour="#cf8a2e")

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.sparse.linalg import LinearOperator, cg
 
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
@@ -83,25 +84,19 @@ class SymmetricField:
         target, weight, scale: (S, V); weight is 0 where nothing was observed. start: (n, n) first guess.
         """
         w = (weight * scale**2).astype(np.float32)
-        right = self.gather((weight * scale * target).astype(np.float32))
-        precondition = 1.0 / (self.penalty + 0.5 * w.sum())
-        y = start
-        residual = right - self.gather(w * self.at_spots(y)) - self.penalty * y
-        z = residual * precondition
-        direction, size = z, float((residual * z).sum())
-        stop = TOLERANCE**2 * float((right * right * precondition).sum())
-        for _ in range(MOST_STEPS):
-            if size <= stop:
-                return y
-            image = self.gather(w * self.at_spots(direction)) + self.penalty * direction
-            length = size / float((direction * image).sum())
-            y = y + length * direction
-            residual = residual - length * image
-            z = residual * precondition
-            before, size = size, float((residual * z).sum())
-            direction = z + size / before * direction
-        log.warning("completion: conjugate gradients stopped after %d steps", MOST_STEPS)
-        return y
+        # Preconditioned from both sides, so that the residual is judged as the preconditioner weighs it.
+        half = 1.0 / np.sqrt(self.penalty + np.float32(0.5) * w.sum())
+
+        def apply(unknown: F32) -> F32:
+            y = half * unknown.reshape(half.shape)
+            return np.asarray(half * (self.gather(w * self.at_spots(y)) + self.penalty * y)).ravel()
+
+        system = LinearOperator((half.size, half.size), matvec=apply, dtype=np.float32)
+        right = half * self.gather((weight * scale * target).astype(np.float32))
+        y, steps = cg(system, right.ravel(), (start / half).ravel(), rtol=TOLERANCE, maxiter=MOST_STEPS)
+        if steps:
+            log.warning("completion: conjugate gradients stopped after %d steps", steps)
+        return np.asarray(half * y.reshape(half.shape))
 
 
 @dataclass(frozen=True)

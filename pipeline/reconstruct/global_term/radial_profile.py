@@ -13,7 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
+from scipy.linalg import block_diag
 
+from pipeline.calibrate.least_squares import Linearised, Prior
 from pipeline.reconstruct.samples.distances import Pairs
 from pipeline.reconstruct.samples.samples import ANGULAR, Samples
 
@@ -158,17 +160,16 @@ def fit_profile(
     leaning = Tilt.basis(pairs.distance, edge) * direction_bias[:, :, None]
     slopes = np.zeros(leaning.shape[2])
     bend = np.diff(np.eye(n), 2, axis=0)
-    stiff = np.eye(n + len(slopes))
-    stiff[:n, :n] = bend.T @ bend
+    prior = Prior(np.zeros(n + len(slopes)), block_diag(bend.T @ bend, np.eye(len(slopes))))
     for _ in range(ITERATIONS):
         expected = pairs.mean(profile)
         jacobian = basis.copy()
         slope = pairs.histogram @ (profile(pairs.centres)[:, None] * near_basis)
         jacobian[pairs.first, pairs.second] = slope / expected[pairs.first, pairs.second][:, None]
         relative, weight = measured.residual(expected * np.exp(offset + leaning @ slopes))
-        flat, w = np.concatenate([jacobian, leaning], axis=2).reshape(-1, len(stiff)), weight.ravel()
+        flat, w = np.concatenate([jacobian, leaning], axis=2).reshape(-1, n + len(slopes)), weight.ravel()
         now = np.concatenate([profile.coefficients, slopes])
-        step = np.linalg.solve((flat * w[:, None]).T @ flat + stiff, flat.T @ (w * relative.ravel()) - stiff @ now)
+        step = Linearised(now, -relative.ravel(), flat, w, prior).step()
         step *= min(1.0, 2.0 / np.abs(step).max())
         profile, slopes = Profile(knots, now[:n] + step[:n]), now[n:] + step[n:]
         if np.abs(step).max() < ENOUGH:
