@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from scipy.optimize import least_squares
 
 F64 = NDArray[np.float64]
 
-TOLERANCES = {"ftol": 1e-12, "xtol": 1e-10, "gtol": 1e-12}  # far below any error bar
+END = 1e-10  # relative change of the sum or of the unknowns: far below any error bar
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,9 @@ class Huber:
         size = np.minimum(self.size(residual), self.cut)
         cost = np.where(size > self.limit, self.limit * (2 * size - self.limit), size**2)
         return np.repeat(cost / self.width, self.width)
+
+
+SQUARES = Huber(np.inf)
 
 
 @dataclass(frozen=True)
@@ -107,7 +111,7 @@ def minimise(
     start: F64,
     prior: Prior,
     jacobian: Callable[[F64], F64] | None = None,
-    loss: Huber | None = None,
+    loss: Huber = SQUARES,
 ) -> Linearised:
     """The unknowns where the sum of squares is least, linearised there.
 
@@ -119,24 +123,23 @@ def minimise(
     known = values > 0  # what nothing is known of has no row
     root = np.sqrt(values[known])[:, None] * vectors.T[known]
 
+    def rows(x: F64) -> F64:
+        return np.concatenate([residual(x), root @ (x - prior.mean)])
+
+    def derivatives(x: F64) -> F64:
+        return np.concatenate([derivative(x), root])
+
     def rho(squares: F64) -> F64:
-        sizes, linear = np.sqrt(squares[: len(squares) - len(root)]), squares[len(squares) - len(root) :]
-        assert loss is not None
-        cost, weight = loss.cost(sizes), loss.weight(sizes)
+        sizes, linear = np.split(squares, [len(squares) - len(root)])
+        cost, weight = loss.cost(np.sqrt(sizes)), loss.weight(np.sqrt(sizes))
         of_prior = [linear, np.ones_like(linear), np.zeros_like(linear)]
         return np.concatenate([[cost, weight, np.zeros_like(cost)], of_prior], axis=1)
 
-    found = least_squares(
-        lambda x: np.concatenate([residual(x), root @ (x - prior.mean)]),
-        start,
-        jac=lambda x: np.concatenate([derivative(x), root]),
-        x_scale="jac",
-        loss="linear" if loss is None else rho,
-        **TOLERANCES,
-    )
+    given: Any = rho  # scipy's stubs expect more of it than scipy
+    found = least_squares(rows, start, derivatives, loss=given, x_scale="jac", ftol=END, xtol=END, gtol=END)
     x = np.asarray(found.x, np.float64)
     misses = residual(x)
-    return Linearised(x, misses, derivative(x), np.ones(len(misses)) if loss is None else loss.weight(misses), prior)
+    return Linearised(x, misses, derivative(x), loss.weight(misses), prior)
 
 
 def _differences(residual: Callable[[F64], F64], x: F64) -> F64:

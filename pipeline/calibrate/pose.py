@@ -199,10 +199,12 @@ def _coarse(start: _Sweep, masks: Sequence[NDArray[np.bool_]], mesh: trimesh.Tri
         for _ in range(COARSE_STEPS):
             rims = [outline(mesh, sweep.view(v)) for v in range(len(masks))]
             j = np.concatenate([sweep.jacobian(v, rim) for v, rim in enumerate(rims)])
-            away = np.concatenate([
-                ndimage.map_coordinates(distance, rim.pixel.T[::-1] - 0.5, order=1, mode="nearest")
-                for distance, rim in zip(distances, rims, strict=True)
-            ])
+            away = np.concatenate(
+                [
+                    ndimage.map_coordinates(distance, rim.pixel.T[::-1] - 0.5, order=1, mode="nearest")
+                    for distance, rim in zip(distances, rims, strict=True)
+                ]
+            )
             weight = np.concatenate([rim.length for rim in rims]) * Huber(HUBER_COARSE_PX).weight(away)
             step = Linearised(total, away, j, weight, prior).step()
             sweep, total = sweep.moved(step), total + step
@@ -264,13 +266,13 @@ def _fine(
         fit = Linearised(total, -rest, j, weight / variance, prior)
         step = fit.step()
         sweep, total = sweep.moved(step), total + step
-    fit = replace(fit, residual=j @ step - rest)
+    fit = replace(fit, residual=np.asarray(j @ step - rest, np.float64))
     inverse, meat = np.linalg.inv(fit.precision), fit.scatter(sector)
     for c in range(len(sweep.lenses)):
         common = sector // (SECTORS * len(sweep.angles)) == c
         push = j[common].T @ weight[common] * (COMMON_EDGE_PX / variance)
         meat += np.outer(push, push)
-    surface = surface_error(j, -fit.residual, fit.weight, length, place, inverse)
+    surface = surface_error(fit, length, place)
     meat += surface.push
     # Lenses are held where the boards put them, but their errors are passed on (Schmidt's consider covariance).
     held = _lens_rows(sweep)

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.calibrate.least_squares import Linearised
+
 F64 = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
@@ -36,18 +38,17 @@ class SurfaceError:
     push: F64
 
 
-def surface_error(j: F64, rest: F64, weight: F64, length: F64, place: F64, inverse: F64) -> SurfaceError:
+def surface_error(fit: Linearised, length: F64, place: F64) -> SurfaceError:
     """The patches' error.
 
-    j: (K, P), rest: (K,) pixels that the fit leaves, weight: (K,) 1/pixels^2, length: (K,) pixels of outline, place:
-    (K, 4) object frame, mm, and pixels per mm, inverse: (P, P) of the fit's precision.
+    fit: K residuals in pixels, length: (K,) pixels of outline, place: (K, 4) object frame, mm, and pixels per mm.
 
     An error that is itself estimated, with n degrees of freedom, leaves Student's distribution: n / (n - 2) as wide.
     Where no two edges are near but not adjacent, nothing is known of it: zeros, and a warning.
     """
-    every = -(-len(rest) // MOST_EDGES)
-    j, rest, length, place = j[::every], rest[::every], length[::every], place[::every]
-    weight = weight[::every] * every
+    every, inverse = -(-len(place) // MOST_EDGES), np.linalg.inv(fit.precision)
+    j, rest, length, place = fit.jacobian[::every], fit.residual[::every], length[::every], place[::every]
+    weight = fit.weight[::every] * every
     apart = np.linalg.norm(place[:, None, :3] - place[None, :, :3], axis=2)
     taken = inverse @ (j * weight[:, None]).T  # (P, K)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeline.calibrate.least_squares import Linearised, Prior
 from pipeline.calibrate.scan_error import surface_error
 
 RADIUS, SCALE = 18.0, 3.3  # mm, pixels per mm
@@ -17,6 +18,12 @@ def outlines() -> tuple[np.ndarray, np.ndarray]:
     place = np.concatenate([np.column_stack(x) for x in ((c, s, none), (c, none, s), (none, c, s))])
     columns = [np.ones(120), np.cos(around), np.sin(around), 2 * np.cos(2 * around), 2 * np.sin(2 * around)]
     return np.column_stack([place, np.full(360, SCALE)]), SCALE * np.tile(np.column_stack(columns), (3, 1))
+
+
+def left(j: np.ndarray, rest: np.ndarray, weight: np.ndarray) -> Linearised:
+    """A fit without a prior, and what it leaves."""
+    unknowns = np.zeros(j.shape[1])
+    return Linearised(unknowns, rest, j, weight, Prior(unknowns, np.diag(unknowns)))
 
 
 @pytest.mark.parametrize("length_mm", [5.0, 10.0, 20.0])
@@ -36,7 +43,7 @@ def test_the_scans_error_and_what_it_does_are_known(length_mm: float) -> None:
         error = 0.1 * SCALE * root @ rng.standard_normal(360) + noise
         for edges, sizes in ((error, found), (noise, white)):
             step = inverse @ (j.T @ (weight * edges))
-            scan = surface_error(j, edges - j @ step, weight, np.ones(360), place, inverse)
+            scan = surface_error(left(j, edges - j @ step, weight), np.ones(360), place)
             sizes.append(scan.size_mm)
             if edges is error:
                 scores.append(step / np.sqrt(np.diag(inverse @ scan.push @ inverse)))
@@ -59,7 +66,7 @@ def test_what_is_hardly_known_has_a_wide_error() -> None:
     for _ in range(100):
         error = 0.1 * SCALE * root @ rng.standard_normal(120) + 0.02 * rng.standard_normal(120)
         step = inverse @ (j.T @ (weight * error))
-        scan = surface_error(j, error - j @ step, weight, np.ones(120), place, inverse)
+        scan = surface_error(left(j, error - j @ step, weight), np.ones(120), place)
         if scan.size_mm > 0:
             scores.append(step / np.sqrt(np.diag(inverse @ scan.push @ inverse)))
     assert len(scores) > 90
@@ -71,8 +78,8 @@ def test_edges_that_say_nothing_of_patches(larger: float, caplog: pytest.LogCapt
     """No two edges of a crumb, or of few edges on a large object, are near and not adjacent: nothing, and a warning."""
     place, j = (x[:: 1 if larger < 1 else 6] for x in outlines())
     place[:, :3] *= larger
-    weight, inverse = np.full(len(place), 0.3**-2), np.linalg.inv(j.T @ j / 0.3**2)
-    scan = surface_error(j, 0.05 * np.ones(len(place)), weight, np.ones(len(place)), place, inverse)
+    ones = np.ones(len(place))
+    scan = surface_error(left(j, 0.05 * ones, 0.3**-2 * ones), ones, place)
     assert scan.size_mm == scan.alike_mm == 0.0
     assert not scan.push.any()
     assert "apart" in caplog.text

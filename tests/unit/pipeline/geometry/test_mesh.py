@@ -58,6 +58,61 @@ def test_stiffness_integrates_the_gradient() -> None:
     assert u @ (RayMesh.of(mesh).stiffness @ u) == pytest.approx(5.0 * mesh.area, rel=1e-12)
 
 
+def bumpy() -> trimesh.Trimesh:
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=5.0)
+    mesh.vertices *= 1.0 + 0.2 * np.sin(2.0 * mesh.vertices[:, :1])
+    return mesh
+
+
+def test_matrices_are_those_of_the_textbook() -> None:
+    """Against sums over the faces' corners: half cotangents for the Laplacian, area / 12 (1 + delta) for the masses."""
+    mesh = bumpy()
+    laplacian, mass = np.zeros((2, len(mesh.vertices), len(mesh.vertices)))
+    for face in mesh.faces:
+        corners = mesh.vertices[face]
+        area = 0.5 * np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0]))
+        mass[np.ix_(face, face)] += area / 12 * (1 + np.eye(3))
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            half = 0.5 * (corners[i] - corners[k]) @ (corners[j] - corners[k]) / (2 * area)
+            laplacian[face[[i, j, i, j]], face[[j, i, i, j]]] += half * np.array([-1, -1, 1, 1])
+    surface = RayMesh.of(mesh)
+    np.testing.assert_allclose(surface.stiffness.toarray(), laplacian, atol=1e-10)
+    np.testing.assert_allclose(surface.mass_matrix.toarray(), mass, atol=1e-12)
+    np.testing.assert_allclose(surface.vertex_areas, mass.sum(axis=1), rtol=1e-12)
+
+
+def test_first_hits_are_the_nearest_of_all_triangles() -> None:
+    """Against every plane and every triangle in double precision; rays near an edge may take either side's triangle."""
+    mesh, rng = bumpy(), np.random.default_rng(0)
+    surface, origins = RayMesh.of(mesh), 20.0 * rng.standard_normal((300, 3))
+    directions = 4.0 * rng.standard_normal((300, 3)) - origins
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    a, b, c = np.moveaxis(np.asarray(mesh.triangles), 1, 0)
+    nearest = np.full(300, np.inf)
+    for n, (o, d) in enumerate(zip(origins, directions, strict=True)):
+        edges = np.stack([np.broadcast_to(-d, a.shape), b - a, c - a], axis=2)
+        t, u, v = np.linalg.solve(edges, (o - a)[..., None])[..., 0].T
+        inside = (t > 0) & (u >= 0) & (v >= 0) & (u + v <= 1)
+        nearest[n] = t[inside].min(initial=np.inf)
+    hit = surface.first_hit(origins, directions)
+    assert 100 < np.isfinite(nearest).sum() < 300
+    np.testing.assert_allclose(hit.distance, nearest, rtol=1e-5)
+    some = np.flatnonzero(hit.triangle >= 0)
+    at = surface.points(hit.triangle[some], hit.barycentric[some])
+    np.testing.assert_allclose(at, origins[some] + nearest[some, None] * directions[some], atol=1e-4)
+    hats = surface.interpolation(hit.triangle[some], hit.barycentric[some])
+    np.testing.assert_allclose(hats @ mesh.vertices, at, atol=1e-12)
+
+
+def test_a_mesh_is_prepared_once_until_it_changes() -> None:
+    mesh = bumpy()
+    before = RayMesh.of(mesh)
+    assert RayMesh.of(mesh) is before
+    mesh.vertices *= 2.0
+    np.testing.assert_allclose(RayMesh.of(mesh).areas, 4.0 * before.areas)
+
+
 def test_harmonics_of_the_sphere() -> None:
     """Rationale: eigenvalues on a sphere of radius r are l (l + 1) / r^2, 2 l + 1 times each."""
     found = harmonics(trimesh.creation.icosphere(subdivisions=3, radius=10.0), 9).eigenvalues * 100.0
