@@ -43,7 +43,8 @@ from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.faults.actual_rig import nudge
 from disco_twin.light.truth import Truth
 from disco_twin.run.stages import Run, begin_run, capture_stages, pipeline_stage, truth_stages
-from pipeline.calibrate.calibration import Calibration, pose_rows
+from pipeline.calibrate.calibration import Calibration
+from pipeline.geometry.camera import pose_rows
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SCENE = REPOSITORY / "scenes" / "quick.toml"

@@ -23,7 +23,8 @@ from disco_twin.faults.actual_rig import ActualRig, actual_rig
 from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.errors import InputError
 from hw.base.files import write_json
-from pipeline.calibrate.calibration import Calibration, ProjectorCalibration, nominal_calibration, pair, pose_rows
+from pipeline.calibrate.calibration import Calibration, ProjectorCalibration, nominal_calibration, pair
+from pipeline.geometry.camera import pose_rows
 
 FORMAT_VERSION = 1
 RECORD = "budget.json"

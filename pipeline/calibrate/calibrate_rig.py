@@ -24,7 +24,6 @@ from pipeline.calibrate.calibration import (
     ProjectorCalibration,
     ViewCalibration,
     pair,
-    pose_rows,
     triple,
 )
 from pipeline.calibrate.peaks import Peak, brightness, find_peak, footprint, seen
@@ -33,7 +32,7 @@ from pipeline.calibrate.pose import PoseFit, fit_poses
 from pipeline.calibrate.projector_fit import GATE, ProjectorFit, StepSize, projection, refine, step_size
 from pipeline.calibrate.projector_prior import nominal_projector, with_pose_error
 from pipeline.calibrate.response import Response
-from pipeline.calibrate.target_images import CameraImages, illumination, intact, measure_response, read_targets
+from pipeline.calibrate.target_images import CameraImages, intact, measure_response, read_targets
 from pipeline.geometry.camera import turn
 from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.nominal_rig import RigConfig
@@ -95,7 +94,7 @@ def measure_poses(
     images = []
     for view in range(stream.plan.views):
         raw = intact(stream.read(ImageAddress(view, "silhouette")))
-        images.append(to_radiance(raw, sensor, 0).radiance / illumination(cameras[stream.plan.camera_of(view)].lens))
+        images.append(to_radiance(raw, sensor, 0).radiance / cameras[stream.plan.camera_of(view)].lens.illumination())
     lenses = [c.lens.seen_from(turn(angles[0])) for c in cameras]
     return fit_poses(images, mesh, lenses, angles, [c.intrinsics.covariance for c in cameras])
 
@@ -210,29 +209,19 @@ def mean_power(stream: StreamReader) -> F64:
 
 
 def assemble(
-    rig: RigConfig,
-    sensor: Sensor,
-    cameras: Sequence[CameraImages],
-    poses: PoseFit,
-    fit: ProjectorFit,
-    watts: F64,
+    rig: RigConfig, sensor: Sensor, cameras: Sequence[CameraImages], poses: PoseFit, fit: ProjectorFit, watts: F64
 ) -> Calibration:
     """The calibration file's content."""
     angles = [float(a) for a in np.deg2rad(rig.turntable_angles_deg)]
     views = []
     for v, camera in enumerate(poses.views):
-        own = cameras[v // len(angles)]
+        own, config = cameras[v // len(angles)], rig.cameras[v // len(angles)]
         spread = np.sqrt(np.diag(own.intrinsics.covariance))
         views.append(
-            ViewCalibration(
-                camera=rig.cameras[v // len(angles)].name,
-                angle_rad=angles[v % len(angles)],
-                width=camera.width,
-                height=camera.height,
-                focal_px=pair(camera.focal),
-                centre_px=pair(camera.centre),
-                distortion=tuple(float(x) for x in camera.distortion),  # type: ignore[arg-type]
-                object_to_camera=pose_rows(camera.pose),
+            ViewCalibration.of(
+                config.name,
+                angles[v % len(angles)],
+                camera,
                 focal_error_px=float(spread[0]),
                 centre_error_px=pair(spread[1:3]),
                 rotation_error_rad=triple(poses.rotation[v]),
@@ -242,22 +231,17 @@ def assemble(
             )
         )
     spread = np.sqrt(np.diag(fit.covariance))
-    projectors = []
-    for j, angle in enumerate(angles):
-        seen_from = replace(fit.projector).seen_from(poses.turns[j])
-        projectors.append(
-            ProjectorCalibration(
-                angle_rad=angle,
-                steps=seen_from.steps,
-                full_angle_rad=pair(seen_from.full_angle_rad),
-                separation_mm=seen_from.separation_mm,
-                beam_diameter_mm=rig.projector.beam_diameter_mm,
-                object_to_projector=pose_rows(seen_from.pose),
-                rotation_error_rad=triple(spread[:3]),
-                translation_error_mm=triple(spread[3:6]),
-                full_angle_error_rad=pair(spread[6:8]),
-            )
+    projectors = [
+        ProjectorCalibration.of(
+            angle,
+            fit.projector.seen_from(turned),
+            rig.projector.beam_diameter_mm,
+            rotation_error_rad=triple(spread[:3]),
+            translation_error_mm=triple(spread[3:6]),
+            full_angle_error_rad=pair(spread[6:8]),
         )
+        for angle, turned in zip(angles, poses.turns, strict=True)
+    ]
     scatter = np.max([c.balance.scatter for c in cameras], axis=0)
     lasers = tuple(
         LaserCalibration(wavelength_nm=config.wavelength_nm, power_w=float(w), power_error_w=float(w * s))

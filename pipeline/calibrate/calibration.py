@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +23,11 @@ from hw.base.errors import InputError
 from hw.base.files import write_atomically
 from hw.interface import Aim
 from hw.record import RadianceImage, RawImage, Sensor, to_radiance
-from pipeline.geometry.camera import PinholeCamera, turn
+from pipeline.geometry.camera import PinholeCamera, Pose, pose_rows, turn
 from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.geometry.projector import TwoMirrorProjector
 
 F64 = NDArray[np.float64]
-Row = tuple[float, float, float, float]
-Pose = tuple[Row, Row, Row, Row]
 NotNegative = Annotated[float, Field(ge=0)]
 Error = NotNegative | None  # one standard deviation; None: not measured
 Errors3 = tuple[NotNegative, NotNegative, NotNegative] | None  # the same along x, y, z of the device's frame
@@ -58,6 +56,16 @@ class ViewCalibration(Strict):
     radiance_factor: tuple[Annotated[float, Field(gt=0)], ...] = ()
     radiance_factor_error: tuple[NotNegative, ...] = ()
 
+    @classmethod
+    def of(cls, name: str, angle_rad: float, camera: PinholeCamera, **measured: Any) -> Self:
+        """A camera in the object frame at a turntable angle; `measured`: the other fields."""
+        k1, k2, p1, p2, k3 = (float(x) for x in camera.distortion)
+        return cls(
+            camera=name, angle_rad=angle_rad, width=camera.width, height=camera.height, focal_px=pair(camera.focal),
+            centre_px=pair(camera.centre), distortion=(k1, k2, p1, p2, k3), object_to_camera=pose_rows(camera.pose),
+            **measured,
+        )  # fmt: skip
+
 
 class ProjectorCalibration(Strict):
     """The projector at one turntable angle; its pose is relative to the object, which turns."""
@@ -71,6 +79,15 @@ class ProjectorCalibration(Strict):
     rotation_error_rad: Errors3 = None
     translation_error_mm: Errors3 = None
     full_angle_error_rad: Errors2 = None
+
+    @classmethod
+    def of(cls, angle_rad: float, projector: TwoMirrorProjector, beam_diameter_mm: float, **measured: Any) -> Self:
+        """A projector in the object frame at a turntable angle; `measured`: the other fields."""
+        return cls(
+            angle_rad=angle_rad, steps=projector.steps, full_angle_rad=pair(projector.full_angle_rad),
+            separation_mm=projector.separation_mm, beam_diameter_mm=beam_diameter_mm,
+            object_to_projector=pose_rows(projector.pose), **measured,
+        )  # fmt: skip
 
 
 class LaserCalibration(Strict):
@@ -179,17 +196,9 @@ def _illumination(
 ) -> F64:
     """(H, W) cos^exponent of the angle off the axis. Kept: the views of a camera share it, and every image needs it."""
     camera = PinholeCamera(width, height, np.array(focal), np.array(centre), np.array(distortion), np.eye(4))
-    xy = camera.undistort((camera.pixel_centres() - camera.centre) / camera.focal)
-    cosine = 1.0 / np.sqrt(1.0 + (xy**2).sum(axis=1))
-    gain = np.asarray(cosine.reshape(height, width) ** exponent)
+    gain = camera.illumination(exponent)
     gain.flags.writeable = False
     return gain
-
-
-def pose_rows(matrix: F64) -> Pose:
-    """(4, 4) as the file's nested tuples."""
-    rows: list[Row] = [(float(a), float(b), float(c), float(d)) for a, b, c, d in matrix]
-    return rows[0], rows[1], rows[2], rows[3]
 
 
 def pair(values: F64) -> tuple[float, float]:
@@ -205,33 +214,12 @@ def triple(values: F64) -> tuple[float, float, float]:
 def nominal_calibration(rig: RigConfig, sensor: Sensor) -> Calibration:
     """The calibration that would hold if the rig stood exactly as its configuration says."""
     angles = [float(np.deg2rad(a)) for a in rig.turntable_angles_deg]
-    views = []
-    for config in rig.cameras:
-        camera = PinholeCamera.from_config(config)
-        for angle in angles:
-            views.append(
-                ViewCalibration(
-                    camera=config.name,
-                    angle_rad=angle,
-                    width=config.width,
-                    height=config.height,
-                    focal_px=pair(camera.focal),
-                    centre_px=pair(camera.centre),
-                    distortion=config.distortion,
-                    object_to_camera=pose_rows(camera.seen_from(turn(angle)).pose),
-                )
-            )
-    projector = TwoMirrorProjector.from_config(rig.projector)
-    projectors = tuple(
-        ProjectorCalibration(
-            angle_rad=angle,
-            steps=projector.steps,
-            full_angle_rad=pair(projector.full_angle_rad),
-            separation_mm=projector.separation_mm,
-            beam_diameter_mm=rig.projector.beam_diameter_mm,
-            object_to_projector=pose_rows(projector.seen_from(turn(angle)).pose),
-        )
-        for angle in angles
+    cameras = [(config.name, PinholeCamera.from_config(config)) for config in rig.cameras]
+    projector, beam = TwoMirrorProjector.from_config(rig.projector), rig.projector.beam_diameter_mm
+    return Calibration(
+        source="nominal",
+        views=tuple(ViewCalibration.of(name, a, c.seen_from(turn(a))) for name, c in cameras for a in angles),
+        projectors=tuple(ProjectorCalibration.of(a, projector.seen_from(turn(a)), beam) for a in angles),
+        lasers=tuple(LaserCalibration(wavelength_nm=x.wavelength_nm, power_w=x.power_mw * 1e-3) for x in rig.lasers),
+        sensor=sensor,
     )
-    lasers = tuple(LaserCalibration(wavelength_nm=x.wavelength_nm, power_w=x.power_mw * 1e-3) for x in rig.lasers)
-    return Calibration(source="nominal", views=tuple(views), projectors=projectors, lasers=lasers, sensor=sensor)

@@ -58,8 +58,7 @@ def pixel_areas(camera: PinholeCamera, plane: F64) -> F64:
 
     camera: in its own frame (its pose is not used)
     """
-    xy = camera.undistort((camera.pixel_centres() - camera.centre) / camera.focal)
-    rays = np.column_stack([xy, np.ones(len(xy))])
+    rays = camera.ahead(camera.pixel_centres())
     normal, shift = plane[:3, 2], plane[:3, 3]
     depth = (shift @ normal) / (rays @ normal)
     slope = np.abs(rays @ normal)  # cosine to the plane times the ray's length

@@ -33,10 +33,7 @@ def nominal_projector(
 
 
 def against_cameras(
-    nominal: TwoMirrorProjector,
-    cameras: Sequence[PinholeCamera],
-    found: Sequence[PinholeCamera],
-    errors: Sequence[F64],
+    nominal: TwoMirrorProjector, cameras: Sequence[PinholeCamera], found: Sequence[PinholeCamera], errors: Sequence[F64]
 ) -> tuple[TwoMirrorProjector, F64]:
     """The projector in the found poses' frame, mean over the cameras, and the (6, 6) covariance of its pose.
 

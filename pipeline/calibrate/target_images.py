@@ -103,7 +103,7 @@ def _plates(
 ) -> tuple[Balance, F64, F64]:
     """Balance, and the spots' (N, 3) places in the camera's frame with their (N, 2) steps."""
     plan, lasers = stream.plan, stream.plan.lasers
-    gain = 1.0 / illumination(lens)
+    gain = 1.0 / lens.illumination()
     light: list[list[float]] = []
     reading: list[list[float]] = []
     place, points, steps = [], [], []
@@ -148,12 +148,6 @@ def _plates(
     return white, np.array(points), np.array(steps, float)
 
 
-def illumination(lens: PinholeCamera) -> F64:
-    """(H, W) cos^4 of the angle off the axis."""
-    xy = lens.undistort((lens.pixel_centres() - lens.centre) / lens.focal)
-    return np.asarray((1.0 + (xy**2).sum(axis=1)).reshape(lens.height, lens.width) ** -2)
-
-
 def _same_side(config: object, rig: RigConfig, pose: F64) -> bool:
     """Whether the camera sees the plate's lit side (nominally)."""
     to_camera = np.subtract(config.position_mm, pose[:3, 3])  # type: ignore[attr-defined]
@@ -163,6 +157,5 @@ def _same_side(config: object, rig: RigConfig, pose: F64) -> bool:
 
 def _on_plane(lens: PinholeCamera, pixel: F64, pose: F64) -> F64:
     """(3,) where a pixel's ray meets the plane z = 0 of a (4, 4) plane -> camera; camera's frame."""
-    xy = lens.undistort(((pixel - lens.centre) / lens.focal)[None])[0]
-    ray = np.array([*xy, 1.0])
+    ray = lens.ahead(pixel[None])[0]
     return np.asarray(ray * (pose[:3, 3] @ pose[:3, 2]) / (ray @ pose[:3, 2]))

@@ -13,9 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hw.base.errors import InputError
+from pipeline.geometry.distortion import distort
 from pipeline.geometry.nominal_rig import CameraConfig
 
 F64 = NDArray[np.float64]
+Row = tuple[float, float, float, float]
+Pose = tuple[Row, Row, Row, Row]  # a (4, 4) transform in a file
 
 
 def look_at(position: ArrayLike, aim: ArrayLike, up: ArrayLike = (0, 0, 1)) -> F64:
@@ -44,6 +47,12 @@ def turn(angle_rad: float) -> F64:
     """(4, 4) transform object -> world of a turntable at `angle_rad`, counter-clockwise from above."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+
+
+def pose_rows(matrix: F64) -> Pose:
+    """(4, 4) as a file's nested tuples."""
+    rows: list[Row] = [(float(a), float(b), float(c), float(d)) for a, b, c, d in matrix]
+    return rows[0], rows[1], rows[2], rows[3]
 
 
 @dataclass(frozen=True)
@@ -80,15 +89,8 @@ class PinholeCamera:
         return np.asarray(-self.pose[:3, :3].T @ self.pose[:3, 3])
 
     def distort(self, xy: F64) -> F64:
-        """(N, 2) normalised coordinates -> distorted ones (OpenCV's rational model without the denominator)."""
-        k1, k2, p1, p2, k3 = self.distortion
-        x, y = xy[:, 0], xy[:, 1]
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        return np.stack(
-            [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y],
-            axis=1,
-        )
+        """(N, 2) normalised coordinates -> distorted ones."""
+        return distort(xy, self.distortion)
 
     def undistort(self, xy: F64) -> F64:
         """Inverse of `distort` by Newton's method with a numerical Jacobian; exact to 1e-12 where it is invertible."""
@@ -128,10 +130,19 @@ class PinholeCamera:
         corners = np.array([[0, 0], [self.width, 0], [0, self.height], [self.width, self.height]], float)
         return float(np.linalg.norm(self.undistort((corners - self.centre) / self.focal), axis=1).max())
 
+    def ahead(self, pixels: F64) -> F64:
+        """(N, 2) pixel coordinates (x, y) -> (N, 3) directions in the camera's own frame, each with z = 1."""
+        xy = self.undistort((np.asarray(pixels, float) - self.centre) / self.focal)
+        return np.column_stack([xy, np.ones(len(xy))])
+
+    def illumination(self, exponent: float = 4.0) -> F64:
+        """(H, W) light on the pixels relative to the optical axis: the power of the cosine off the axis."""
+        cosine = 1.0 / np.linalg.norm(self.ahead(self.pixel_centres()), axis=1)
+        return np.asarray(cosine.reshape(self.height, self.width) ** exponent)
+
     def rays(self, pixels: F64) -> tuple[F64, F64]:
         """(N, 2) pixel coordinates (x, y) -> (N, 3) origins and unit directions in the frame."""
-        xy = self.undistort((np.asarray(pixels, float) - self.centre) / self.focal)
-        local = np.column_stack([xy, np.ones(len(xy))])
+        local = self.ahead(pixels)
         local /= np.linalg.norm(local, axis=1, keepdims=True)
         directions = local @ self.pose[:3, :3]
         return np.broadcast_to(self.position, directions.shape).copy(), directions

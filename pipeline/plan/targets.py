@@ -17,14 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from hw.base.config import Strict
 from hw.interface import Aim
-from pipeline.geometry.camera import PinholeCamera, look_at
+from pipeline.geometry.camera import PinholeCamera, Pose, look_at, pose_rows
 from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
 from pipeline.geometry.projector import TwoMirrorProjector
 from pipeline.plan.plan import Plan
 
 F64 = NDArray[np.float64]
-Row = tuple[float, float, float, float]
-Pose = tuple[Row, Row, Row, Row]
 
 TARGETS = "targets.json"
 FOLDER = "calibration"  # in the capture's folder
@@ -80,10 +78,10 @@ def make_targets(rig: RigConfig, camera: int) -> tuple[Targets, Plan]:
     config = rig.cameras[camera]
     placements = []
     for mount in (0, 1):
-        pose = _rows(_plate_pose(rig, config, float(mount)))
+        pose = pose_rows(_plate_pose(rig, config, float(mount)))
         placements += [Placement(kind=kind, mount=mount, pose=pose) for kind in ("white", "board")]
     for k in range(BOARDS):
-        placements.append(Placement(kind="board", mount=2 + k, pose=_rows(_board_pose(config, k))))
+        placements.append(Placement(kind="board", mount=2 + k, pose=pose_rows(_board_pose(config, k))))
     placements.append(placements[2])
     targets = Targets(
         camera=config.name,
@@ -101,7 +99,7 @@ def make_targets(rig: RigConfig, camera: int) -> tuple[Targets, Plan]:
 def make_bracket(rig: RigConfig, camera: int) -> tuple[Targets, Plan]:
     """A board under the floodlight, once for each exposure: its white, its black and the greys along their borders."""
     config, (targets, _) = rig.cameras[camera], make_targets(rig, camera)
-    board = Placement(kind="board", mount=2, pose=_rows(_board_pose(config, 3)))
+    board = Placement(kind="board", mount=2, pose=pose_rows(_board_pose(config, 3)))
     still = targets.model_copy(update={"placements": (board,) * rig.sensor.steps})
     angles = tuple(float(k) for k in range(rig.sensor.steps))
     return still, Plan((config.name,), angles, (), len(rig.lasers))
@@ -155,11 +153,6 @@ def _plate_aims(rig: RigConfig, config: CameraConfig, pose: F64, index: int) -> 
     centre, half = (low + high) / 2, (high - low) / 2 * 0.75
     u, v = (np.rint(np.linspace(centre[k] - half[k], centre[k] + half[k], PLANE_GRID)).astype(int) for k in (0, 1))
     return series + [Aim(index, int(a), int(b)) for a in u for b in v]
-
-
-def _rows(matrix: F64) -> Pose:
-    rows: list[Row] = [(float(a), float(b), float(c), float(d)) for a, b, c, d in matrix]
-    return rows[0], rows[1], rows[2], rows[3]
 
 
 def save_targets(targets: Targets, path: Path) -> None:

@@ -22,24 +22,8 @@ from hw.base.resources import usable_cores
 from hw.record import RawImage
 from pipeline.plan.plan import ImageAddress, Plan, load_plan
 from pipeline.stream.codec import decode, encode
-from pipeline.stream.files import (
-    IMAGES,
-    PLAN,
-    StorageError,
-    StreamFiles,
-    end_of,
-    storage_error,
-    write_at,
-)
-from pipeline.stream.layout import (
-    ENTRY_BYTES,
-    HEADER_BYTES,
-    IMAGES_MAGIC,
-    JOURNAL_MAGIC,
-    Entry,
-    ImageMeta,
-    pack_header,
-)
+from pipeline.stream.files import IMAGES, PLAN, StorageError, StreamFiles, end_of, storage_error, write_at
+from pipeline.stream.layout import ENTRY_BYTES, HEADER_BYTES, IMAGES_MAGIC, JOURNAL_MAGIC, Entry, ImageMeta, pack_header
 
 __all__ = ["CorruptImage", "ImageMeta", "StorageError", "StreamReader", "StreamWriter"]
 

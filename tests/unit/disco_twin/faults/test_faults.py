@@ -17,7 +17,8 @@ from disco_twin.object.build import hat_basis
 from disco_twin.scene.scene import load_scene
 from hw.base.errors import InputError
 from hw.interface import Aim
-from pipeline.calibrate.calibration import nominal_calibration, pose_rows
+from pipeline.calibrate.calibration import nominal_calibration
+from pipeline.geometry.camera import pose_rows
 
 QUICK = Path(__file__).parents[4] / "scenes" / "quick.toml"
 

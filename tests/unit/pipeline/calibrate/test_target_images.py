@@ -69,7 +69,7 @@ def test_the_lens_darkens_as_the_twins_does() -> None:
     """The spots on the plate are too near the axis to show it (.1 % of the balance)."""
     rig = faulty_rig()
     lens = actual_rig(rig, 11).cameras[0]
-    true, seen = Lars3.of(rig, lens).vignetting, target_images.illumination(lens)
+    true, seen = Lars3.of(rig, lens).vignetting, lens.illumination()
     np.testing.assert_allclose(seen / seen.max(), true / true.max(), rtol=1e-3)
 
 
