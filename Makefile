@@ -58,7 +58,7 @@ references: $(READY)
 	$(BIN)/disco-twin reference scenes/quick.toml --out scenes/references/quick
 
 picture: $(READY)
-	$(BIN)/python -m disco_twin.cli.readme_picture $(OUT) docs/picture.png
+	$(BIN)/python -m benchmarks.readme_picture $(OUT) docs/picture.png
 
 curves: $(READY)
 	$(BIN)/python -m benchmarks walk --json docs/benchmarks/walk.json

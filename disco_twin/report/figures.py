@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+
+STYLE = Path(__file__).with_name("templates") / "figures.mplstyle"
 
 INK, FAINT, TRUTH = "#22272e", "#c9cdd3", "#22272e"
 SPARE = ("#8a5a9e", "#b5534f", "#3d8f8f", "#7a6f3a")
@@ -32,31 +35,11 @@ def colour(method: str) -> str:
 
 def new_figure(width: float, height: float, **subplots: Any) -> tuple[Figure, Any]:
     """A figure that belongs to no window, and its axes, in the report's style. Sizes in inches."""
-    import matplotlib as mpl
+    import matplotlib.style
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    mpl.rcParams.update(
-        {
-            "font.family": ["DejaVu Sans"],
-            "font.size": 9,
-            "axes.edgecolor": "#8b929c",
-            "axes.labelcolor": INK,
-            "axes.titlesize": 9.5,
-            "axes.titlecolor": INK,
-            "axes.spines.top": False,
-            "axes.spines.right": False,
-            "axes.grid": True,
-            "axes.axisbelow": True,
-            "grid.color": "#e8eaed",
-            "grid.linewidth": 0.8,
-            "xtick.color": "#5b626c",
-            "ytick.color": "#5b626c",
-            "legend.frameon": False,
-            "svg.fonttype": "path",
-            "svg.hashsalt": "disco-twin",
-        }
-    )
+    matplotlib.style.use(STYLE)
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure, figure.subplots(**subplots)
@@ -154,26 +137,6 @@ def impulse_figure(impulses: Sequence[Sequence[Impulse]]) -> Figure:
     bar = figure.colorbar(drawn, ax=axes, fraction=0.02, pad=0.01)
     bar.set_label("radiance per watt, 1/(mm² sr)")
     bar.outline.set_visible(False)
-    return figure
-
-
-def picture_figure(spots: Sequence[Impulse], comparisons: Sequence[Comparison], method: str) -> Figure:
-    """The README's picture: two recorded spots on a log scale, then relit above reference for some lights."""
-    columns = 1 + len(comparisons)
-    figure, axes = new_figure(2.0 * columns, 2.85, nrows=2, ncols=columns)
-    for axis, spot, name in zip(
-        axes[:, 0], spots, ("captured: a laser spot (log scale)", "the same spot from behind"), strict=False
-    ):
-        shown = np.log10(np.maximum(spot.radiance, spot.radiance.max() * 1e-5))
-        axis.imshow(shown, cmap="magma")
-        axis.set_title(name, loc="left", fontsize=8)
-    for column, row in zip(axes[:, 1:].T, comparisons, strict=True):
-        exposure = float(np.percentile(row.reference[:, row.mask], 99))
-        for axis, image, name in zip(column, (row.relit[method], row.reference), ("relit", "Mitsuba"), strict=True):
-            axis.imshow(tone(image, exposure, len(image)))
-            axis.set_title(f"{name}: {row.light}", loc="left", fontsize=8)
-    for axis in axes.flat:
-        plain(axis)
     return figure
 
 
