@@ -40,7 +40,7 @@ def frozen_scene() -> Scene:
             "format_version": 1,
             "name": "frozen",
             "object": {"shape": {"kind": "sphere", "radius_mm": RADIUS}, "medium": medium},
-            "scan": {"vertices": 162},
+            "scan": {"vertices": 80},
             "rig": rig().model_dump(),
             "simulation": {"truth_columns": 8},
             "reconstruct": {"methods": ["dipole"]},
@@ -64,7 +64,7 @@ def write_frozen_run(root: Path) -> np.ndarray:
     folder.scene_record.write_text(scene.model_dump_json())
     folder.capture.rmdir()
     write_capture(folder.capture, scan=experiment.scan)
-    pairs, columns = vertex_pairs(experiment.scan), np.arange(0, 160, 20)
+    pairs, columns = vertex_pairs(experiment.scan), np.arange(0, 64, 8)
     exact = np.stack([pairs.mean(lambda d, k=k: reflectance(d, k)) for k in range(2)])
     exact = 0.5 * (exact + exact.transpose(0, 2, 1))
     balance = EnergyBalance(**{name: np.ones(2) for name in EnergyBalance.__dataclass_fields__})
