@@ -48,7 +48,7 @@ class Interpolated:
 
 
 def capture_frames(folder: Path, spots: int, walks: int, angles: int = 3, vertices: int | None = None) -> Experiment:
-    """A whole capture of `spots` spots with `walks` photons each, into `folder / "capture"`; its world.
+    """A whole capture of `spots` spots with `walks` photons each, into `folder / "capture"`; its experiment.
 
     angles: of the turntable, evenly spaced; vertices: of the scan, about, if not the scene's
     """

@@ -41,8 +41,8 @@ def run(quick: bool = False) -> dict[str, Any]:
     angles, spots, rounds = (2, 16, 3) if quick else (12, 24, 5)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        world = capture_frames(folder, angles, 20_000 if quick else 100_000, angles, 2000 if quick else 8924)
-        rig, mesh = world.scene.rig, world.scan
+        experiment = capture_frames(folder, angles, 20_000 if quick else 100_000, angles, 2000 if quick else 8924)
+        rig, mesh = experiment.scene.rig, experiment.scan
         calibration = nominal_calibration(rig, lars3_sensor(rig))
         plan = repeated(folder, spots)
         cpu, readings = time.process_time(), []

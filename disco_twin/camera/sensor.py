@@ -83,14 +83,14 @@ def compress(exposed: Exposed, sensor: Sensor) -> Exposed:
 
 
 def gamma_curve(share: F64) -> F64:
-    """0..1 of the full well -> 0..1 of the digital range; the pipeline is not told."""
+    """0..1 of the full well -> 0..1 of the digital range; the pipeline is not given it."""
     power = 1.0 / GAMMA
     low, high = FOOT**power, (1.0 + FOOT) ** power
     return np.asarray(((share + FOOT) ** power - low) / (high - low))
 
 
 def integrate_for(rate: F64, sensor: Sensor, exponent: int, rng: Generator) -> Exposed:
-    """Electrons per second -> the charge with shot noise after a time that all pixels were told."""
+    """Electrons per second -> the charge with shot noise after a time that is the same for all pixels."""
     mean = np.minimum(np.ldexp(rate * sensor.longest_exposure_s, -exponent), 1e12)
     return Exposed(np.full(rate.shape, exponent, np.int32), rng.poisson(mean).astype(np.float64))
 

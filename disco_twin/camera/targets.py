@@ -74,7 +74,7 @@ class TargetSource:
         fine = self._shade(xy, board).reshape(height, s, width, s)
         image = fine.mean(axis=3).mean(axis=1)
         edge = ndimage.binary_dilation(fine.max(axis=3).max(axis=1) > fine.min(axis=3).min(axis=1))
-        # Inside a pixel the plane's coordinates are linear: a pixel's own rays say where all its points lie.
+        # Inside a pixel the plane's coordinates are linear: where a pixel's own rays meet it gives all its points.
         own = xy.reshape(height, s, width, s, 2).transpose(0, 2, 1, 3, 4)[edge]  # (E, s, s, 2)
         offset = (np.arange(EDGE_SAMPLES) + 0.5) / EDGE_SAMPLES - 0.5
         reach = (s - 1) / s

@@ -138,10 +138,10 @@ def reconstruct(out: RunOut, methods: MethodsOption = None) -> None:
 @app.command()
 def reference(scene: SceneFile, out: RunOut, profile: ProfileOption = "full") -> None:
     """Render the reference images of a scene into DIR, one EXR per light and held-out view."""
-    from disco_twin.experiment.capturable import require_capturable
     from disco_twin.experiment.experiment import Experiment
     from disco_twin.experiment.references import render_references, shipped_references
     from disco_twin.run.progress import stage_bar
+    from disco_twin.run.scan import require_capturable
     from disco_twin.scene.scene import load_scene
 
     loaded = load_scene(scene, profile)
@@ -171,11 +171,11 @@ def score(out: RunOut, methods: MethodsOption = None, budget: BudgetOption = Fal
 
 @app.command()
 def plan(scene: SceneFile, profile: ProfileOption = "full") -> None:
-    """Predict images, bytes and time of a scene, and say what it leaves out. Needs no renderer."""
-    from disco_twin.experiment.capturable import require_capturable
+    """Predict images, bytes and time of a scene, and list what it leaves out. Needs no renderer."""
     from disco_twin.experiment.experiment import Experiment
     from disco_twin.experiment.references import shipped_references
     from disco_twin.run.cost_prediction import predict
+    from disco_twin.run.scan import require_capturable
     from disco_twin.scene.scene import load_scene
 
     with naming(scene):
@@ -221,7 +221,7 @@ def main(arguments: list[str] | None = None) -> Any:
         context = getattr(error, "ctx", None)
         command = "disco-twin" if context is None else context.command_path
         problem = str(error.format_message()).rstrip(".?")
-        return _stop(f"{problem}. Remedy: `{command} --help` says what is allowed", 2)
+        return _stop(f"{problem}. Remedy: `{command} --help` lists what is allowed", 2)
     sys.exit(status if isinstance(status, int) else 0)
 
 

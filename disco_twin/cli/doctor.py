@@ -56,13 +56,12 @@ def examine(folder: Path, timeout_s: float = RENDER_TIMEOUT_S) -> list[Finding]:
 
 
 def _python() -> Finding:
-    version = platform.python_version()
-    return Finding(
-        "python", sys.version_info >= (3, 11), f"{version} on {platform.platform(terse=True)}", "Python 3.11 or newer"
-    )
+    detail = f"{platform.python_version()} on {platform.platform(terse=True)}"
+    return Finding("python", sys.version_info >= (3, 11), detail, "Python 3.11 or newer")
 
 
 def package(name: str) -> Finding:
+    """Whether a package is installed, and its version."""
     try:
         return Finding(name, True, importlib.metadata.version(name))
     except importlib.metadata.PackageNotFoundError:
@@ -73,28 +72,22 @@ def render(timeout_s: float) -> Finding:
     """A small render in a subprocess."""
     remedy = "see the message; `pip install karellen-llvm-core` brings a libLLVM that works"
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", RENDER], capture_output=True, text=True, timeout=timeout_s, check=False
-        )
+        command = [sys.executable, "-c", RENDER]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
     except subprocess.TimeoutExpired:
         return Finding("render", False, f"a small render did not end within {timeout_s:g} s", remedy)
     if done.returncode == 0:
         return Finding("render", True, ANSI.sub("", done.stdout).strip().splitlines()[-1])
-    said = ANSI.sub("", done.stderr.strip() or done.stdout).strip().splitlines()
-    last = said[-1].removeprefix("disco_twin.light.backend.BackendError: ") if said else "nothing was said"
+    lines = ANSI.sub("", done.stderr.strip() or done.stdout).strip().splitlines()
+    last = lines[-1].removeprefix("disco_twin.light.backend.BackendError: ") if lines else "no message"
     if done.returncode < 0:
         return Finding("render", False, f"the renderer was killed by signal {-done.returncode}: {last}", remedy)
     return Finding("render", False, last, "" if "Remedy" in last else remedy)
 
 
 def _machine() -> Finding:
-    memory = total_memory_gb()
-    return Finding(
-        "machine",
-        memory >= MEMORY_GB,
-        f"{usable_cores()} cores, {memory:.1f} GiB of memory",
-        f"the demo needs {MEMORY_GB:g} GiB; `--profile small` needs less",
-    )
+    memory, remedy = total_memory_gb(), f"the demo needs {MEMORY_GB:g} GiB; `--profile small` needs less"
+    return Finding("machine", memory >= MEMORY_GB, f"{usable_cores()} cores, {memory:.1f} GiB of memory", remedy)
 
 
 def _disk(folder: Path) -> Finding:

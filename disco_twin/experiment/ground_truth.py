@@ -1,4 +1,4 @@
-"""The true R_d of a scene: which columns of it are computed, and their computation a few at a time."""
+"""The true R_d of a scene: columns of it, computed a few at a time."""
 
 from __future__ import annotations
 
@@ -21,12 +21,6 @@ if TYPE_CHECKING:
 COLUMNS_AT_ONCE = 4  # between two reports of the progress
 
 
-def columns_of_truth(experiment: Experiment) -> NDArray[np.int64]:
-    """(n,) scan vertices whose column of R_d is computed, spread evenly over the surface."""
-    points = np.asarray(experiment.scan.vertices, float)
-    return np.sort(farthest_points(points, np.ones(len(points)), experiment.scene.simulation.truth_columns))
-
-
 def true_reflectance(experiment: Experiment, columns: Sequence[int] | NDArray[np.int64], walks: int) -> Truth:
     """The true R_d from these scan vertices to all others, from `walks` photons a column. Needs the renderer."""
     basis = hat_basis(experiment.object.mesh, experiment.scan)
@@ -34,11 +28,12 @@ def true_reflectance(experiment: Experiment, columns: Sequence[int] | NDArray[np
 
 
 def compute_truth(experiment: Experiment, path: Path, progress: Progress) -> None:
-    """Write the scene's columns of the true R_d, a few at a time."""
-    columns, walks, parts = columns_of_truth(experiment), experiment.scene.simulation.truth_walks, []
+    """Write the scene's columns of the true R_d, spread evenly over the surface, a few at a time."""
+    points, work, parts = np.asarray(experiment.scan.vertices, float), experiment.scene.simulation, []
+    columns = np.sort(farthest_points(points, np.ones(len(points)), work.truth_columns))
     for low in range(0, len(columns), COLUMNS_AT_ONCE):
         part = columns[low : low + COLUMNS_AT_ONCE]
-        parts.append(true_reflectance(experiment, part, walks))
+        parts.append(true_reflectance(experiment, part, work.truth_walks))
         progress(low + len(part), len(columns))
     _joined(parts).save(path)
 

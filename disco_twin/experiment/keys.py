@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,35 +20,24 @@ FLOORS = ("hw", "pipeline", "disco_twin")
 
 
 def content_key(*parts: Any) -> str:
-    """SHA-256 over the parts: text, bytes, files (their content), or anything that JSON can hold."""
+    """SHA-256 over the parts: text, bytes, files (their content), or anything that JSON can hold, files in it too."""
     digest = hashlib.sha256()
     for part in parts:
-        if isinstance(part, Path):
-            data = part.read_bytes()
-        elif isinstance(part, bytes):
-            data = part
+        if isinstance(part, Path | bytes):
+            data = part.read_bytes() if isinstance(part, Path) else part
         else:
-            data = (part if isinstance(part, str) else json.dumps(part, sort_keys=True)).encode()
+            text = part if isinstance(part, str) else json.dumps(part, sort_keys=True, default=content_key)
+            data = text.encode()
         digest.update(len(data).to_bytes(8, "little"))
         digest.update(data)
     return digest.hexdigest()
 
 
-def plain(value: Any) -> Any:
-    """JSON's types; a file becomes the key of its content."""
-    if isinstance(value, dict):
-        return {k: plain(v) for k, v in value.items()}
-    if isinstance(value, Path):
-        return content_key(value)
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [plain(v) for v in value]
-    return value
-
-
 def identity(scene: Scene) -> str:
     """Key of all that a capture and its ground truth depend on; how they are used may change within a run folder."""
-    parts = scene.model_dump(include={"format_version", "name", "seed", "object", "scan", "rig", "simulation"})
-    return content_key(plain(parts))
+    return content_key(
+        scene.model_dump(include={"format_version", "name", "seed", "object", "scan", "rig", "simulation"})
+    )
 
 
 @cache

@@ -40,7 +40,7 @@ def reconstruct_apart(
     """Run `python -m pipeline` on the capture; its peak memory in MiB. Its messages go to OUT/work/pipeline.log.
 
     calibration: a file to use instead of what the pipeline would calibrate itself.
-    The peak is the process's own word: `wait4` would count what our process held when it started the child.
+    The process reports its peak itself: `wait4` would count what our process held when it started the child.
     """
     request = folder.work / REQUEST
     write_json(request, pipeline_inputs(scene, methods))
@@ -57,9 +57,9 @@ def reconstruct_apart(
                 child.terminate()
                 raise
         errors.seek(0)
-        said = errors.read().strip().splitlines()
+        lines = errors.read().strip().splitlines()
     if status != 0:
-        why = said[-1] if said else f"ended with status {status}"
+        why = lines[-1] if lines else f"ended with status {status}"
         if status == -signal.SIGKILL:
             remedy = "a scan of fewer vertices (scan.vertices), fewer methods, or a machine with more memory"
             raise PipelineFailed(f"{folder.capture}: the pipeline was killed, most likely for memory. Remedy: {remedy}")
@@ -68,7 +68,7 @@ def reconstruct_apart(
 
 
 def load_results(folder: RunFolder) -> PipelineRecord:
-    """What the pipeline's process wrote about its work."""
+    """What the pipeline's process wrote about its work. Raises: InputError where that cannot be read."""
     path = folder.work / "pipeline.json"
     return read_json(path, PipelineRecord, f"delete it, then disco-twin reconstruct --out {folder.root}")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from disco_twin.experiment.experiment import Experiment
-from disco_twin.experiment.keys import content_key, plain
+from disco_twin.experiment.keys import content_key
 from disco_twin.light.references import load_reference, render_reference, save_reference
 from hw.base.errors import InputError
 from hw.base.files import write_atomically
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 def reference_key(scene: Scene, light: Light, view: CameraConfig) -> str:
     """Key of a reference image: object, wavelengths, light and view. More walks make it better, not another one."""
     lasers = [laser.wavelength_nm for laser in scene.rig.lasers]
-    return content_key(plain(scene.object.model_dump()), lasers, plain(light.model_dump()), plain(view.model_dump()))
+    return content_key(scene.object.model_dump(), lasers, light.model_dump(), view.model_dump())
 
 
 def reference_path(folder: Path, light: Light, view: CameraConfig) -> Path:

@@ -1,1 +1,1 @@
-"""What is wrong with the actual rig: set-up errors, drift, speckle. The pipeline is told none of it."""
+"""What is wrong with the actual rig: set-up errors, drift, speckle. The pipeline is given none of it."""

@@ -1,6 +1,6 @@
 """The actual rig: the nominal one, off by what a careful set-up on an optical table is off by.
 
-The pipeline is told the nominal rig only. Without `faults.deviation` the actual rig is the nominal one.
+The pipeline is given the nominal rig only. Without `faults.deviation` the actual rig is the nominal one.
 """
 
 from __future__ import annotations

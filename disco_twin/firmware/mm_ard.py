@@ -37,7 +37,7 @@ class Galvo:
 class MirrorHead:
     """What the board drives. `sample(pin)` is what the converter sees, 0 .. 1023.
 
-    `on_move` hears of every mirror move before it, `on_lines` of every change of the TTL lines after it.
+    `on_move` is called before every mirror move, `on_lines` after every change of the TTL lines.
     """
 
     sample: Callable[[int], int] = lambda pin: 0

@@ -21,7 +21,7 @@ KEPT_BY_PRESETS = Mode.ADHOC | Mode.AUTOSTART | Mode.AUTO_POWERUP
 class LaserHead:
     """State of one laser. `stored_*` survive a power cut; times are on the injected clock.
 
-    `on_start` hears of every LOn that is obeyed by a laser that was off.
+    `on_start` is called at every LOn that starts a laser which was off.
     """
 
     wavelength_nm: float
@@ -159,10 +159,6 @@ def _hexadecimal(text: str, digits: int) -> int:
     return int(text, 16)
 
 
-def _done(good: bool = True) -> str:
-    return ">" if good else "x"
-
-
 def _store_level(head: LaserHead, arguments: str, now: float) -> str:
     value = _hexadecimal(arguments, 3)
     head.stored_level, head.level, head.memory_writes = value, value / LEVELS, head.memory_writes + 1
@@ -223,7 +219,7 @@ COMMANDS: dict[str, Command] = {
     "MDP": lambda head, _, now: f"{head.emission(now) * head.max_power_mw:.4f}",
     "MTD": lambda head, _, now: "25.1",
     "MTA": lambda head, _, now: "x",
-    "LOn": lambda head, _, now: _done(head.switch_on(now)),
+    "LOn": lambda head, _, now: ">" if head.switch_on(now) else "x",
     "LOf": _light_off,
     "POn": lambda head, _, now: _power(head, True),
     "POf": lambda head, _, now: _power(head, False),

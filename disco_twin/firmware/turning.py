@@ -13,8 +13,8 @@ SETTLE_S = 0.3
 class Spindle:
     """Turns at a constant speed, then settles. Angles in degrees, unbounded; `homed` after finding its zero.
 
-    `sticks_at_deg`: the next move that comes by stalls there. `on_move` hears of every angle that it is sent to.
-    After a power cut the stage does not know where it is.
+    `sticks_at_deg`: the next move that comes by stalls there. `on_move` is called with every angle that it is sent to.
+    A power cut loses the reference.
     """
 
     angle_deg: float = 0.0
@@ -60,6 +60,6 @@ class Spindle:
         self._busy_until, self._homing = now, False
 
     def power_cycle(self, now: float) -> None:
-        """The stage stops where it is, and does not know where that is."""
+        """The stage stops where it is, and its reference is lost."""
         self.stop(now)
         self.homed = self.stalled = False

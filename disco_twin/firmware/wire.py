@@ -115,7 +115,7 @@ class Cable:
         self.answer_faults: deque[Fault | None] = deque()
         self.command_faults: deque[Callable[[bytes], bytes] | None] = deque()
         self.plugged = True
-        self.on_closed: Callable[[], None] = lambda: None  # nobody holds the port any more
+        self.on_closed: Callable[[], None] = lambda: None  # the last holder of the port has closed it
         self._users = 0  # an old handle may be closed after a new one was opened
         self._coming: list[Timed] = []  # by the time at which the device begins to send them
         self._free = self._held_until = self._taken = -math.inf
@@ -138,7 +138,7 @@ class Cable:
         self.firmware.power_cycle(self.clock.now())
 
     def say(self, data: bytes) -> None:
-        """The device says something unasked."""
+        """The device sends something unasked."""
         self._send([(0.0, data)], self.clock.now())
 
     def _forget(self) -> None:

@@ -86,7 +86,7 @@ def candidates() -> Iterator[str]:
     system += sorted(Path("/usr/lib").glob("*-linux-gnu"))
     for folder in system:
         yield from _existing(folder, ["libLLVM.so.*", "libLLVM-*.so*", "libLLVM.so", "llvm-*/lib/libLLVM.so*"])
-    for major in range(40, OLDEST_LLVM - 1, -1):  # what the dynamic linker knows
+    for major in range(40, OLDEST_LLVM - 1, -1):  # what the dynamic linker finds
         for name in (f"LLVM-{major}", f"LLVM.so.{major}"):
             if found := ctypes.util.find_library(name):
                 yield found

@@ -20,7 +20,7 @@ class EnergyBalance:
     """Mean fractions of the launched power per wavelength (L,), and their sum's departure from one.
 
     `reflected` never entered, and counts photons that missed the object too. `inside` is lost to images and deposits:
-    of photons that were cut off, or that leaked from a mesh that is not watertight; `warn_of_loss` tells of it.
+    of photons that were cut off, or that leaked from a mesh that is not watertight; `warn_of_loss` reports it.
     launched + roulette = reflected + escaped + absorbed + boundary + inside, up to rounding.
     """
 

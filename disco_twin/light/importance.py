@@ -34,7 +34,7 @@ STEEPEST = 32.0  # ratio of neighbouring cells' targets: where diffusion falls t
 class Splitting:
     """Where each tag's light enters, (T, 3) in mm, and how many times the collisions of an unsplit walk to spend.
 
-    docs/decisions/0050 says what effort buys.
+    What effort buys: docs/decisions/0050.
     """
 
     entries: F64

@@ -20,7 +20,6 @@ from pipeline.geometry.camera import PinholeCamera
 from pipeline.relight.lights import Light
 
 if TYPE_CHECKING:
-    from disco_twin.light.sources import Source
     from disco_twin.light.transport import Transport
 
 F32 = NDArray[np.float32]
@@ -50,11 +49,10 @@ def render_reference(
     """Trace one light towards all cameras at once; `walks` is the number of photons in both halves together."""
     from disco_twin.light.sources import light_source  # what is stored can be read without a renderer
 
-    def source(group: Sequence[int]) -> Source:
-        return light_source(light, transport.radius, group)
-
     half = max(1, walks // 2)
-    traced = transport.trace(source, 2, half, seed=seed, cameras=cameras, layers=2)
+    traced = transport.trace(
+        lambda group: light_source(light, transport.radius, group), 2, half, seed=seed, cameras=cameras, layers=2
+    )
     assert traced.images is not None
     return [Reference(traced.images[:, :, c], half, key) for c in range(len(cameras))]
 

@@ -6,7 +6,6 @@ function of vertex v: cosine in, cosine out, which is what is reciprocal.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +20,6 @@ from pipeline.geometry.fresnel import mean_transmittance
 from pipeline.geometry.mesh import RayMesh
 
 if TYPE_CHECKING:
-    from disco_twin.light.sources import HatSource
     from disco_twin.light.transport import Transport
 
 F64 = NDArray[np.float64]
@@ -77,15 +75,13 @@ def truth_columns(
     hats = np.repeat(basis[:, columns].toarray().T, REPLICATES, axis=0)
     entries = (hats @ transport.vertices) / hats.sum(axis=1, keepdims=True)
 
-    def source(group: Sequence[int]) -> HatSource:
-        return HatSource(transport.vertices, transport.faces, hats, len(group))
-
     replicate = np.tile(np.arange(REPLICATES), len(columns))
     names = (np.repeat(columns, REPLICATES) * REPLICATES + replicate).astype(np.uint32)
     per_replicate = max(1, round(walks / REPLICATES))
     traced = transport.trace(
-        source, len(hats), per_replicate, seed=seed, streams=names, deposit=True, split=Splitting(entries)
-    )
+        lambda group: HatSource(transport.vertices, transport.faces, hats, len(group)),
+        len(hats), per_replicate, seed=seed, streams=names, deposit=True, split=Splitting(entries),
+    )  # fmt: skip
     assert traced.deposits is not None
     n, lasers = len(columns), transport.lasers
     power = np.stack([(basis.T @ deposit.T).T for deposit in traced.deposits])  # (n * replicates, L, V)

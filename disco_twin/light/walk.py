@@ -107,7 +107,7 @@ class Reservoir:
     weight: Any
 
 
-def nobody(weight: Any, lanes: int) -> tuple[Photon, Reservoir]:
+def no_photons(weight: Any, lanes: int) -> tuple[Photon, Reservoir]:
     """Lanes without a photon."""
     vector, number, flag = dr.zeros(mi.Vector3f, lanes), dr.zeros(mi.Float, lanes), dr.zeros(mi.Bool, lanes)
     point, power, integer = dr.zeros(mi.Point3f, lanes), dr.zeros(weight, lanes), dr.zeros(mi.UInt32, lanes)
@@ -248,7 +248,7 @@ def walk(
     counter = dr.zeros(mi.UInt32, 1)
     dr.eval(counter)
     rng = Rng(dr.zeros(mi.UInt32, lanes), dr.zeros(mi.UInt32, lanes))
-    photon, reservoir = nobody(weight, lanes)
+    photon, reservoir = no_photons(weight, lanes)
     flight, rate = dr.zeros(mi.Float, lanes), dr.ones(mi.Float, lanes)
     running = dr.full(mi.Bool, True, lanes)
     stack = new_stack(t, cams is not None, lanes) if window is not None else None

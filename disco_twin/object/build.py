@@ -43,7 +43,7 @@ class TwinObject:
 
 
 def build_object(scene: Scene) -> TwinObject:
-    """The object of a scene."""
+    """The object of a scene. Raises: InputError for a mesh or a medium that cannot be traced."""
     config = scene.object
     mesh = _mesh(config)
     kind = config.boundary.kind
@@ -55,7 +55,10 @@ def build_object(scene: Scene) -> TwinObject:
 
 
 def build_scan(scene: Scene, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh that the pipeline is given: `mesh` itself, or one of about `scan.vertices` vertices."""
+    """The mesh that the pipeline is given: `mesh` itself, or one of about `scan.vertices` vertices.
+
+    Raises: InputError where that is no closed mesh, or one of too many vertices.
+    """
     vertices, shape = scene.scan.vertices, scene.object.shape
     if vertices is None:
         if len(mesh.vertices) > MOST_VERTICES:

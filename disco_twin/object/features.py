@@ -16,7 +16,10 @@ MOST_VEINS = 1e6
 
 
 def coverage(feature: Feature, points: F64, cell: float, mesh: trimesh.Trimesh) -> F64:
-    """(N,) share 0 .. 1 of the voxel of edge `cell` around each of the (N, 3) points that the feature covers."""
+    """(N,) share 0 .. 1 of the voxel of edge `cell` around each of the (N, 3) points that the feature covers.
+
+    Raises: InputError for veins without number.
+    """
     if isinstance(feature, Veins):
         return _sheet(_foam(feature, points, mesh), feature.width_mm, cell)
     if isinstance(feature, Crack):

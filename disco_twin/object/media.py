@@ -40,7 +40,7 @@ class Medium:
 
 
 def build_medium(config: MediumConfig, mesh: trimesh.Trimesh, wavelengths_nm: Sequence[float]) -> Medium:
-    """The medium that fills `mesh`, for each of the lasers."""
+    """The medium that fills `mesh`, for each laser. Raises: InputError for a grid or a feature that does not fit."""
     base = _base(config, mesh, wavelengths_nm)
     return _with_features(config, base, mesh) if config.features else base
 

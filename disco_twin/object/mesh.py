@@ -23,7 +23,7 @@ FINE_TRIANGLES = 20_000  # truth is tallied on the mesh's vertices: triangles ar
 
 
 def read_mesh(path: Path) -> trimesh.Trimesh:
-    """A closed, outward oriented mesh in mm from a PLY, OBJ or STL file; anything else is refused with its reason."""
+    """A closed, outward oriented mesh in mm from a PLY, OBJ or STL file. Raises: InputError for anything else."""
     if path.suffix.lower() not in (".ply", ".obj", ".stl"):
         raise InputError("unknown type of mesh file", file=path, key=KEY, allowed=".ply, .obj, .stl", remedy=_EXPORT)
     try:
@@ -51,7 +51,7 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
 
 
 def check_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
-    """Refuse a mesh that light cannot be traced in, or that was not meant in mm."""
+    """Refuse a mesh that light cannot be traced in, or that was not meant in mm. Raises: InputError."""
     if len(mesh.faces) == 0:
         problem = "the mesh is empty (all its triangles are degenerate)"
         raise InputError(problem, file=path, key=KEY, remedy=_EXPORT)
@@ -66,7 +66,10 @@ def check_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
 
 
 def check_size(mesh: trimesh.Trimesh, key: str, path: Path | None = None) -> None:
-    """Refuse what no rig of about 500 mm working distance can scan, and plates too thin for single precision."""
+    """Refuse what no rig of about 500 mm working distance can scan, and plates too thin for single precision.
+
+    Raises: InputError.
+    """
     size, thinnest = float(mesh.extents.max()), float(mesh.extents.min())
     remedy = None
     if size < SMALLEST_MM:
@@ -109,7 +112,7 @@ def remesh(mesh: trimesh.Trimesh, vertices: int) -> trimesh.Trimesh:
     """About `vertices` vertices near the surface of `mesh`, triangles of nearly equal area (Botsch and Kobbelt 2004).
 
     The result is scaled about its centroid to the area of `mesh`: flat triangles between points of a convex surface
-    lie inside it and would receive too little light.
+    lie inside it and would receive too little light. Raises: InputError where no closed mesh comes out.
     """
     edge = float(np.sqrt(mesh.area / (2 * vertices) * 4 / np.sqrt(3)))
     out = mesh

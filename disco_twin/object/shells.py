@@ -19,6 +19,7 @@ def check_shells(mesh: trimesh.Trimesh, path: Path, key: str, flip: str) -> None
     """Refuse a closed, consistently oriented mesh whose shells do not bound a solid.
 
     A shell inside another one is a cavity and has to be oriented inwards; one inside a cavity is solid again.
+    Raises: InputError.
     """
     place = crossing(mesh)
     if place is not None:

@@ -24,7 +24,7 @@ class Voxels:
 
 
 def read_voxels(path: Path, lasers: int, key: str, highest: float = np.inf) -> Voxels:
-    """Read and check a grid: finite, 0 .. `highest`, one channel or one a laser."""
+    """Read and check a grid: finite, 0 .. `highest`, one channel or one a laser. Raises: InputError for any other."""
     if path.suffix == ".npy":
         voxels = _read_npy(path, key)
     elif path.suffix == ".vol":
@@ -85,7 +85,7 @@ def _read_vol(path: Path, key: str) -> Voxels:
         raise InputError(problem, file=path, key=key, allowed="1 (float32)", remedy=_VOL)
     count = nx * ny * nz * channels
     if min(nx, ny, nz, channels) < 1 or len(data) != 48 + 4 * count:
-        problem = f"the .vol file has {len(data)} bytes, its header says {48 + 4 * count}"
+        problem = f"the .vol file has {len(data)} bytes, its header states {48 + 4 * count}"
         raise InputError(problem, file=path, key=key, remedy=_VOL)
     if not (np.isfinite(corners).all() and (corners[:3] < corners[3:]).all()):
         problem = f"the .vol file's corners are {corners[:3].tolist()} and {corners[3:].tolist()}"

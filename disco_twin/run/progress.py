@@ -99,7 +99,7 @@ class _Screen(logging.Handler):
 
 
 class _LogFile(logging.FileHandler):
-    """run.log. A disk that takes no more of it is said once, on the screen, and does not end the run."""
+    """run.log. A disk that takes no more of it is reported once, on the screen, and does not end the run."""
 
     def __init__(self, path: Path, console: Console) -> None:
         super().__init__(path, encoding="utf-8")

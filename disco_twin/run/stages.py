@@ -72,7 +72,7 @@ class Run:
         return self.experiment.scene
 
     def key(self, stage: str, *inputs: Any) -> str:
-        """Key of a stage: what the scene says of the rig and the object, the stage's code, its other inputs."""
+        """Key of a stage: what the scene states of rig and object, the stage's code, its other inputs."""
         return content_key(self.folder.identity, code_key(*CODE[stage]), *inputs)
 
     def stage(self, name: str, key: str, work: Callable[[Report], Any], unit: str = "") -> None:

@@ -1,4 +1,4 @@
-"""A scene: one TOML file that says what is simulated, captured, reconstructed and relit."""
+"""A scene: one TOML file that states what is simulated, captured, reconstructed and relit."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _colours(light: Light) -> list[Colour]:
 def load_scene(path: str | Path, profile: Profile = "full", faults: bool | None = None) -> Scene:
     """Read a scene; file names inside it are relative to its folder. `small` shrinks it, see `shrink`.
 
-    faults: every fault of the rig is on or off, whatever the scene says
+    faults: every fault of the rig is on or off, whatever the scene states. Raises: InputError.
     """
     scene = load_toml(path, Scene, others={"board": "a rig file", "turntable": "a rig file"})
     if faults is not None:

@@ -85,7 +85,7 @@ class SensorConfig(Strict):
     read_noise_e: Annotated[float, Field(ge=0, le=1e3)] = 25.0
     dark_e_per_s: Annotated[float, Field(ge=0, le=1e6)] = 500.0
     offset_dn: Annotated[float, Field(ge=0, le=1024)] = 64.0
-    response: Literal["linear", "curved"] = "linear"  # curved: digital numbers have yet to be told what they stand for
+    response: Literal["linear", "curved"] = "linear"  # curved: what a digital number stands for has to be calibrated
 
 
 class RigConfig(Strict):

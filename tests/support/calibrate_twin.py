@@ -34,14 +34,14 @@ QUICK = Path(__file__).parents[2] / "scenes" / "quick.toml"
 
 
 @cache
-def world() -> Experiment:
+def experiment() -> Experiment:
     """The quick scene, before an ideal rig."""
     return Experiment(load_scene(QUICK, faults=False))
 
 
 def faulty_rig(width: int = 192, angles: tuple[float, ...] = (0.0, 120.0, 240.0)) -> TwinRigConfig:
     """The quick scene's rig with deviation and flare; 768 gives the Lars III's own resolution."""
-    rig = world().scene.rig
+    rig = experiment().scene.rig
     faults = rig.faults.model_copy(update={"deviation": True, "flare": True})
     cameras = tuple(
         c.model_copy(update={"width": width, "height": width * 124 // 192, "pixel_pitch_um": 44.0 * 192 / width})
@@ -203,6 +203,6 @@ def capture_all(
             still, exposures = make_bracket(rig, c)
             source = TargetSource(still, lens, actual, rig.projector.beam_diameter_mm / 2)
             capture(BracketRig(rig, source, seed, actual, c, len(still.placements)), exposures, own / BRACKET)
-    source = Glowing(rig, actual, mesh or world().object.mesh)
-    capture(TwinRig(rig, source, seed, actual), make_plan(rig, world().scan), folder)
+    source = Glowing(rig, actual, mesh or experiment().object.mesh)
+    capture(TwinRig(rig, source, seed, actual), make_plan(rig, experiment().scan), folder)
     return rig

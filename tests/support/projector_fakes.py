@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from calibrate_twin import faulty_rig, shifted, world
+from calibrate_twin import experiment, faulty_rig, shifted
 from numpy.typing import NDArray
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
@@ -33,10 +33,10 @@ class Lit:
 
 
 def lit(seed: int, noise: float = 0.05, false: float = 0.2) -> Lit:
-    rig, rng, mesh = faulty_rig(), np.random.default_rng(seed), world().object.mesh
+    rig, rng, mesh = faulty_rig(), np.random.default_rng(seed), experiment().object.mesh
     actual = actual_rig(rig, seed)
-    turns = [actual.turns[aim.angle] for aim in world().plan.spots]
-    origin, way = actual.spot_rays(world().plan.spots)
+    turns = [actual.turns[aim.angle] for aim in experiment().plan.spots]
+    origin, way = actual.spot_rays(experiment().plan.spots)
     points, ray, face = RayMeshIntersector(mesh).intersects_location(origin, way, multiple_hits=False)
     normals, way = mesh.face_normals[face], way[ray]
     moved = [turns[r] for r in ray]
@@ -51,7 +51,7 @@ def lit(seed: int, noise: float = 0.05, false: float = 0.2) -> Lit:
         seen = seen + shifted(direction - (direction * normals).sum(axis=1, keepdims=True) * normals)
     bad = rng.random(len(points)) < false
     seen[bad] += 8 * rng.standard_normal((bad.sum(), 3))
-    steps = np.array([(world().plan.spots[r].u, world().plan.spots[r].v) for r in ray], float)
+    steps = np.array([(experiment().plan.spots[r].u, experiment().plan.spots[r].v) for r in ray], float)
     full = actual.projector.full_angle_rad
     size = StepSize(full * (1 + 0.002 * rng.standard_normal(2)), np.diag((0.002 * full) ** 2))
     nominal = TwoMirrorProjector.from_config(rig.projector)

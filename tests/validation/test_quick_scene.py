@@ -24,12 +24,12 @@ def test_a_fifth_of_the_light_leaves_beyond_three_edges(repository: Path) -> Non
 
     Expected behaviour: at least a fifth of all light (measured: .207 +- .005; by wavelength .217 .209 .193).
     """
-    world = Experiment(load_scene(repository / "scenes" / "quick.toml", faults=False))
-    mesh, edge = world.object.mesh, float(world.scan.edges_unique_length.mean())
+    experiment = Experiment(load_scene(repository / "scenes" / "quick.toml", faults=False))
+    mesh, edge = experiment.object.mesh, float(experiment.scan.edges_unique_length.mean())
     area = RayMesh.of(mesh).vertex_areas
     at = np.random.default_rng(0).choice(len(area), SPOTS, replace=False, p=area / area.sum())
     place, normal = np.asarray(mesh.vertices)[at], np.asarray(mesh.vertex_normals)[at]
-    transport = Transport(world.object)
+    transport = Transport(experiment.object)
 
     def beams(group: object) -> BeamSource:
         return BeamSource(place + 100.0 * normal, -normal, 1.0, np.ones((SPOTS, len(group))))  # type: ignore[arg-type]

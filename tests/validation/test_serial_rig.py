@@ -24,21 +24,21 @@ def test_quick_through_serial_lines_equals_the_direct_twin(repository: Path, tmp
     Expected behaviour: 1806 images, and the three files of the stream are the same bytes; no light while anything
     moves, never two lasers at once.
     """
-    world = Experiment(load_scene(repository / "scenes" / "quick.toml", faults=False))
-    scene, transport = world.scene, world.transport
+    experiment = Experiment(load_scene(repository / "scenes" / "quick.toml", faults=False))
+    scene, transport = experiment.scene, experiment.transport
     from disco_twin.light.response import SpotResponses
 
     actual = actual_rig(scene.rig, scene.seed)
 
     def twin() -> TwinRig:
         walks, light = scene.simulation.walks_per_spot, tmp_path / "light"
-        responses = SpotResponses(transport, scene.rig, actual, walks, world.seed("spots"), light)
+        responses = SpotResponses(transport, scene.rig, actual, walks, experiment.seed("spots"), light)
         return TwinRig(scene.rig, responses, scene.seed, actual)
 
     direct, serial = tmp_path / "direct", tmp_path / "serial"
-    assert capture(twin(), world.plan, direct).images == 1806
+    assert capture(twin(), experiment.plan, direct).images == 1806
     emulated = Emulation(twin())
-    capture(emulated.serial_rig(tmp_path / "logs"), world.plan, serial)
+    capture(emulated.serial_rig(tmp_path / "logs"), experiment.plan, serial)
     for name in (IMAGES, JOURNAL, PLAN):
         assert (serial / name).read_bytes() == (direct / name).read_bytes(), name
     assert emulated.bench.hazards == []

@@ -16,7 +16,6 @@ from scene_fakes import sphere
 from scene_texts import GOOD
 
 from disco_twin.evaluate.scores import load_relit, load_scores
-from disco_twin.experiment.capturable import require_capturable
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.pipeline_process import load_results, pipeline_inputs, stale
 from disco_twin.experiment.references import render_references
@@ -26,6 +25,7 @@ from disco_twin.light.truth import Truth
 from disco_twin.object.mesh import read_mesh
 from disco_twin.object.voxels import read_voxels
 from disco_twin.run.progress import run_log
+from disco_twin.run.scan import require_capturable
 from disco_twin.scene.scene import Scene, load_scene
 from hw.base.config import read_json
 from hw.base.errors import InputError, naming, refused_by_the_disk
@@ -334,8 +334,8 @@ def test_warnings_are_seen_on_the_screen(tmp_path: Path) -> None:
 
 
 def test_a_mesh_too_large_for_a_model(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = sphere()
-    scene = world.scene.model_copy(update={"scan": world.scene.scan.model_copy(update={"vertices": None})})
+    experiment = sphere()
+    scene = experiment.scene.model_copy(update={"scan": experiment.scene.scan.model_copy(update={"vertices": None})})
     monkeypatch.setattr("disco_twin.object.build.MOST_VERTICES", 500)
     with pytest.raises(InputError) as caught:
         _ = Experiment(scene).scan

@@ -30,8 +30,8 @@ def test_one_switch_turns_all_faults_on_or_off() -> None:
 
 
 def test_a_scanned_object_differs_from_the_object_by_the_scanners_errors() -> None:
-    world = Experiment(load_scene(QUICK))
-    exact, scan = world.object.mesh, world.scan
+    experiment = Experiment(load_scene(QUICK))
+    exact, scan = experiment.object.mesh, experiment.scan
     assert scan.is_watertight
     assert abs(len(scan.vertices) / 1600 - 1) < 0.03
     assert abs((scan.volume / exact.volume) ** (1 / 3) - 1) * 18 < 0.15

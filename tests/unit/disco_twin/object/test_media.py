@@ -258,5 +258,5 @@ def test_vol_files_are_mitsubas(channels: int, tmp_path: Path) -> None:
     built = medium(folder=tmp_path, base=base)
     np.testing.assert_allclose(built.high, [11, 9, 7])
     (tmp_path / "grid.vol").write_bytes(bytes(data[:-4]))
-    with pytest.raises(InputError, match="its header says"):
+    with pytest.raises(InputError, match="its header states"):
         medium(folder=tmp_path, base=base)

@@ -16,15 +16,15 @@ SCENE = Path(__file__).parents[4] / "scenes" / "quick.toml"
 
 
 @pytest.fixture(scope="module")
-def world() -> Experiment:
+def experiment() -> Experiment:
     return Experiment(load_scene(SCENE))
 
 
-def changed(world: Experiment, **simulation: Any) -> Experiment:
+def changed(experiment: Experiment, **simulation: Any) -> Experiment:
     """The same scene and object with other walks."""
-    work = world.scene.simulation.model_copy(update=simulation)
-    other = Experiment(world.scene.model_copy(update={"simulation": work}))
-    vars(other).update(object=world.object, scan=world.scan, plan=world.plan)
+    work = experiment.scene.simulation.model_copy(update=simulation)
+    other = Experiment(experiment.scene.model_copy(update={"simulation": work}))
+    vars(other).update(object=experiment.object, scan=experiment.scan, plan=experiment.plan)
     return other
 
 
@@ -37,34 +37,34 @@ def changed(world: Experiment, **simulation: Any) -> Experiment:
         ("reference_walks", "references"),
     ],
 )
-def test_a_stage_takes_as_long_as_its_walks(world: Experiment, key: str, stage: str) -> None:
+def test_a_stage_takes_as_long_as_its_walks(experiment: Experiment, key: str, stage: str) -> None:
     """Expected behaviour: three times the walks, three times that stage, and no other; half the cores, twice all."""
-    once = simulation_seconds(world, 7, 2)
-    more = simulation_seconds(changed(world, **{key: 3 * getattr(world.scene.simulation, key)}), 7, 2)
+    once = simulation_seconds(experiment, 7, 2)
+    more = simulation_seconds(changed(experiment, **{key: 3 * getattr(experiment.scene.simulation, key)}), 7, 2)
     for name, value in once.items():
         assert more[name] == pytest.approx((3 if name == stage else 1) * value)
-    assert simulation_seconds(world, 7, 1) == pytest.approx({name: 2 * value for name, value in once.items()})
-    assert simulation_seconds(world, 14, 2)["references"] == pytest.approx(2 * once["references"])
+    assert simulation_seconds(experiment, 7, 1) == pytest.approx({name: 2 * value for name, value in once.items()})
+    assert simulation_seconds(experiment, 14, 2)["references"] == pytest.approx(2 * once["references"])
 
 
-def test_wavelengths_that_scatter_alike_share_their_walks(world: Experiment) -> None:
+def test_wavelengths_that_scatter_alike_share_their_walks(experiment: Experiment) -> None:
     """Expected behaviour: quick's three lasers walk once; where each scatters by itself, three times."""
     from dataclasses import replace
 
-    medium = world.object.medium
+    medium = experiment.object.medium
     own = medium.sigma_t.copy()
     own[1] *= 1.1
     own[2] *= 1.2
-    apart = changed(world)
-    vars(apart).update(object=replace(world.object, medium=replace(medium, sigma_t=own)))
-    once = simulation_seconds(world, 7, 2)
+    apart = changed(experiment)
+    vars(apart).update(object=replace(experiment.object, medium=replace(medium, sigma_t=own)))
+    once = simulation_seconds(experiment, 7, 2)
     assert simulation_seconds(apart, 7, 2) == pytest.approx({name: 3 * value for name, value in once.items()})
 
 
-def test_references_beside_the_scene_cost_nothing(world: Experiment, tmp_path: Path) -> None:
+def test_references_beside_the_scene_cost_nothing(experiment: Experiment, tmp_path: Path) -> None:
     """Expected behaviour: a run takes them from there, so the plan counts those that are missing or of other walks."""
-    there = dict(predict(world, shipped_references(SCENE, "quick")))
+    there = dict(predict(experiment, shipped_references(SCENE, "quick")))
     assert "none to render" in there["references"]
-    assert "minutes" in dict(predict(world, tmp_path))["references"]
-    more = changed(world, reference_walks=100 * world.scene.simulation.reference_walks)
+    assert "minutes" in dict(predict(experiment, tmp_path))["references"]
+    more = changed(experiment, reference_walks=100 * experiment.scene.simulation.reference_walks)
     assert "minutes" in dict(predict(more, shipped_references(SCENE, "quick")))["references"]

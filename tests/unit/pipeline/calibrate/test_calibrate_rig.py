@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from axis_truth import F64, true_axis
-from calibrate_twin import SHIFT, capture_all, world
+from calibrate_twin import SHIFT, capture_all, experiment
 from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
@@ -40,7 +40,7 @@ def judge(found: Measured, rig: TwinRigConfig, seed: int, folder: Path) -> Judge
     own, actual = found.calibration, actual_rig(rig, seed)
     true = true_calibration(rig, actual, nominal_calibration(rig, lars3_sensor(rig)))
     aims = load_plan(folder / "plan.json").spots
-    places = [_hits(world().object.mesh, *c.spot_rays(aims)) for c in (_steady(rig, seed), own)]
+    places = [_hits(experiment().object.mesh, *c.spot_rays(aims)) for c in (_steady(rig, seed), own)]
     away = np.linalg.norm(places[0] - places[1], axis=1)
     ways = [c.spot_rays(aims)[1] for c in (true, own)]
     turned = np.arccos(np.clip((ways[0] * ways[1]).sum(axis=1), -1, 1))
@@ -93,7 +93,7 @@ def captured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TwinRigCon
 @pytest.fixture(scope="module")
 def measured(captured: tuple[Path, TwinRigConfig]) -> Measured:
     folder, rig = captured
-    return measure(folder, rig, lars3_sensor(rig), world().object.mesh)
+    return measure(folder, rig, lars3_sensor(rig), experiment().object.mesh)
 
 
 def test_a_rig_is_calibrated_from_its_own_images(captured: tuple[Path, TwinRigConfig], measured: Measured) -> None:
@@ -134,7 +134,7 @@ def test_a_scan_in_a_frame_of_its_own_gives_the_same_projector(
     Expected: .5 sigma at most, for images are the same. (Held to its place in the rig's own frame: 17 sigma.)
     """
     folder, rig = captured
-    motion, mesh = np.eye(4), world().object.mesh.copy()
+    motion, mesh = np.eye(4), experiment().object.mesh.copy()
     motion[:3, :3] = Rotation.from_rotvec([0, 0, np.deg2rad(3.0)]).as_matrix()
     motion[2, 3] = 10.0
     mesh.apply_transform(motion)
@@ -167,7 +167,7 @@ def test_the_power_of_every_image_is_known(captured: tuple[Path, TwinRigConfig])
 def test_a_rig_with_curved_cameras_is_calibrated_as_well(tmp_path: Path) -> None:
     """The same bounds as for linear ones, from brackets that the cameras took; the calibration holds the response."""
     rig = capture_all(tmp_path, 11, curved=True)
-    found = measure(tmp_path, rig, lars3_sensor(rig), world().object.mesh)
+    found = measure(tmp_path, rig, lars3_sensor(rig), experiment().object.mesh)
     judged = judge(found, rig, 11, tmp_path)
     assert judged.spots_mm < 0.15
     assert judged.incidence_deg < 0.3
@@ -189,7 +189,7 @@ def test_uncertainties_are_honest(tmp_path: Path) -> None:
     for seed in range(50, 62):
         folder = tmp_path / str(seed)
         rig = capture_all(folder, seed)
-        judged = judge(measure(folder, rig, lars3_sensor(rig), world().object.mesh), rig, seed, folder)
+        judged = judge(measure(folder, rig, lars3_sensor(rig), experiment().object.mesh), rig, seed, folder)
         assert judged.spots_mm < 0.2, seed
         assert judged.incidence_deg < 0.3, seed
         for name, z in judged.scores.items():

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from calibrate_twin import Glowing, faulty_rig, world
+from calibrate_twin import Glowing, experiment, faulty_rig
 from numpy.typing import NDArray
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
@@ -34,11 +34,11 @@ class Hidden:
 @pytest.fixture(scope="module")
 def hidden() -> Hidden:
     rig = faulty_rig(angles=(0.0,))
-    actual, mesh = actual_rig(rig, 6), world().object.mesh
+    actual, mesh = actual_rig(rig, 6), experiment().object.mesh
     source, caster = Glowing(rig, actual, mesh), RayMeshIntersector(mesh)
     found, visible, power = [], [], []
     rng = np.random.default_rng(4)
-    aims = [a for a in world().plan.spots if a.angle == 0][::2]
+    aims = [a for a in experiment().plan.spots if a.angle == 0][::2]
     for camera in range(2):
         eye = actual.camera(camera, 0).position
         for aim in aims:

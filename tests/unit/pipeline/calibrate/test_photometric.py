@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import trimesh
-from calibrate_twin import faulty_rig, world
+from calibrate_twin import experiment, faulty_rig
 
 from disco_twin.faults.light_faults import LaserPower
 from disco_twin.object.scanner import LARGEST_MM, NOISE_MM, geometry_error, scan_points
@@ -119,7 +119,7 @@ def test_a_hidden_spot_is_recognised() -> None:
 
 
 def test_a_scan_becomes_a_mesh_of_nearly_equal_triangles() -> None:
-    fine = world().object.mesh
+    fine = experiment().object.mesh
     found = reconstruct_surface(*scan_points(fine, 3), 1600)
     areas = found.mesh.area_faces
     assert abs(len(found.mesh.vertices) / 1600 - 1) < 0.03
@@ -134,7 +134,7 @@ def test_a_scan_becomes_a_mesh_of_nearly_equal_triangles() -> None:
 
 def test_a_bare_object_is_seen_too_deep() -> None:
     """Figure 4.8: deviation and noise grow with the translucency; spray ends both."""
-    fine = world().object.mesh
+    fine = experiment().object.mesh
     bare = reconstruct_surface(*scan_points(fine, 3, free_path_mm=0.8, sprayed=False), 800)
     coated = reconstruct_surface(*scan_points(fine, 3, free_path_mm=0.8), 800)
     assert bare.noise_mm > 3 * coated.noise_mm
@@ -143,7 +143,7 @@ def test_a_bare_object_is_seen_too_deep() -> None:
 
 
 def test_the_scanner_errs_as_the_thesis_says() -> None:
-    points = np.asarray(world().object.mesh.vertices)
+    points = np.asarray(experiment().object.mesh.vertices)
     errors = np.array([geometry_error(points, np.random.default_rng(s)) for s in range(40)])
     assert np.sqrt((errors**2).mean()) == pytest.approx(0.1, rel=0.1)
     assert np.clip(errors, -LARGEST_MM, LARGEST_MM).max() <= LARGEST_MM

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 from axis_truth import true_axis
-from calibrate_twin import Silhouettes, faulty_rig, floodlit, photograph, silhouettes, world
+from calibrate_twin import Silhouettes, experiment, faulty_rig, floodlit, photograph, silhouettes
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -36,7 +36,7 @@ def pushed(seen: Silhouettes, rng: np.random.Generator) -> list[PinholeCamera]:
 
 def test_an_irregular_object_is_found_from_afar() -> None:
     """Expected with the exact mesh: .15 mm across, 1 mm along the axis, .1 degrees, from 10 mm and 10 degrees off."""
-    mesh = world().object.mesh
+    mesh = experiment().object.mesh
     seen = silhouettes(4, mesh)
     found = fit_poses(seen.images, mesh, pushed(seen, np.random.default_rng(0)), seen.angles)
     turned, shifted = errors(found, seen.truth)
@@ -49,7 +49,7 @@ def test_an_irregular_object_is_found_from_afar() -> None:
 
 def test_a_broken_stage_shows() -> None:
     """Half a pixel, a turntable that runs the other way and degrees taken for radians: the bounds are missed."""
-    mesh = world().scan
+    mesh = experiment().scan
     seen = silhouettes(4, mesh)
     lens, shifted = seen.lenses[0], replace(seen.lenses[0], centre=seen.lenses[0].centre + 0.5)
     for start, angles in (
@@ -87,7 +87,7 @@ def test_a_symmetric_object_gets_a_stated_ambiguity() -> None:
 
 def test_all_views_share_one_axis() -> None:
     """The turns that were found are rotations about one line, by nearly the nominal angles."""
-    mesh = world().scan
+    mesh = experiment().scan
     seen = silhouettes(4, mesh)
     found = fit_poses(seen.images, mesh, seen.lenses, seen.angles)
     axes = [Rotation.from_matrix(t[:3, :3]).as_rotvec() for t in found.turns[1:]]
@@ -101,7 +101,7 @@ def test_all_views_share_one_axis() -> None:
 def test_a_turntable_that_leans_is_found_to_lean() -> None:
     """By two degrees. Expected: its axis within four of its own standard deviations, which are small against that."""
     rig = faulty_rig()
-    mesh, camera = world().object.mesh, PinholeCamera.from_config(rig.cameras[0])
+    mesh, camera = experiment().object.mesh, PinholeCamera.from_config(rig.cameras[0])
     lean = np.eye(4)
     lean[:3, :3] = Rotation.from_rotvec(np.deg2rad([1.5, -0.6, 0.0])).as_matrix()
     angles = [float(a) for a in np.deg2rad(rig.turntable_angles_deg)]
