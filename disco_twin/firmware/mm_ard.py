@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from disco_twin.firmware.turning import approach
 from disco_twin.firmware.wire import Timed
 from hw.devices.mm_ard import BAUD, BOOT_S, LINES, PINS, STEPS
 
@@ -24,9 +25,7 @@ class Galvo:
 
     def position(self, now: float) -> float:
         """In steps."""
-        way = (now - self.since) * STEPS / GALVO_S
-        left = self.target - self.start
-        return self.target if abs(left) <= way else self.start + (way if left > 0 else -way)
+        return approach(self.start, self.target, (now - self.since) * STEPS / GALVO_S)
 
     def aim(self, target: int, now: float) -> None:
         """A new DAC value."""

@@ -9,6 +9,12 @@ SPEED_DEG_S = 45.0
 SETTLE_S = 0.3
 
 
+def approach(start: float, target: float, way: float) -> float:
+    """Where something stands that has gone `way` from `start` towards `target`, and no farther than that."""
+    left = target - start
+    return target if abs(left) <= way else start + (way if left > 0 else -way)
+
+
 @dataclass
 class Spindle:
     """Turns at a constant speed, then settles. Angles in degrees, unbounded; `homed` after finding its zero.
@@ -31,9 +37,7 @@ class Spindle:
 
     def position(self, now: float) -> float:
         """Degrees."""
-        way = max(0.0, now - self._since) * SPEED_DEG_S
-        left = self.angle_deg - self._start
-        return self.angle_deg if abs(left) <= way else self._start + (way if left > 0 else -way)
+        return approach(self._start, self.angle_deg, max(0.0, now - self._since) * SPEED_DEG_S)
 
     def busy(self, now: float) -> bool:
         """Whether it still moves or settles."""

@@ -20,11 +20,7 @@ class ZaberFirmware(LineFirmware):
     baud = BAUD
 
     def __init__(
-        self,
-        spindle: Spindle,
-        microsteps_per_deg: float = MICROSTEPS_PER_DEG,
-        address: int = 1,
-        stage: str = "rotary",
+        self, spindle: Spindle, microsteps_per_deg: float = MICROSTEPS_PER_DEG, address: int = 1, stage: str = "rotary"
     ) -> None:
         super().__init__(b"\r\n")
         self.spindle, self.microsteps_per_deg, self.address = spindle, microsteps_per_deg, address
@@ -84,18 +80,10 @@ class ZaberFirmware(LineFirmware):
     def warnings(self, now: float) -> list[str]:
         """Flags, the most important first."""
         self.spindle.busy(now)
-        flags = [
-            flag
-            for flag, on in (
-                ("FH", self.emergency_stop),
-                ("FD", not self.driver_on),
-                ("FS", self.spindle.stalled and not self.spindle.busy(now)),
-                ("WR", not self.spindle.homed),
-                ("NI", self.interrupted),
-            )
-            if on
-        ]
-        return flags or ["--"]
+        stalled = self.spindle.stalled and not self.spindle.busy(now)
+        flags = {"FH": self.emergency_stop, "FD": not self.driver_on, "FS": stalled}
+        flags |= {"WR": not self.spindle.homed, "NI": self.interrupted}
+        return [flag for flag, on in flags.items() if on] or ["--"]
 
     def _do(self, words: list[str], now: float) -> tuple[bool, str]:
         """A command: accepted or not, and the data of the answer."""

@@ -59,15 +59,9 @@ class SpotResponses:
     """
 
     def __init__(
-        self,
-        transport: Transport,
-        config: RigConfig,
-        actual: ActualRig,
-        walks: int,
-        seed: int,
-        scratch: Path,
+        self, transport: Transport, config: RigConfig, actual: ActualRig, walks: int, seed: int, scratch: Path,
         code: str = "",
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.transport, self.config, self.actual = transport, config, actual
         self.walks, self.seed, self.scratch = walks, seed, scratch
         self.views = [
