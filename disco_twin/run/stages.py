@@ -141,7 +141,7 @@ def drop_outdated(folder: RunFolder, stage: str, key: str) -> None:
     with folder.alone():
         old = [path for pattern in CONTINUED[stage] for path in folder.root.glob(pattern) if path.is_file()]
         if old:
-            log.warning("the simulation's code has changed: the %s in %s are made again", stage, folder.root)
+            log.warning("the simulation's code has changed: what it left of %s in %s is made again", stage, folder.root)
         for path in old:
             path.unlink()
         write_atomically(marker, key.encode())
