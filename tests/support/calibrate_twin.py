@@ -91,7 +91,13 @@ def silhouettes(seed: int, mesh: trimesh.Trimesh, rig: TwinRigConfig | None = No
 
 
 def boards(seed: int, rig: TwinRigConfig, camera: int) -> tuple[Targets, list[F32], PinholeCamera]:
-    """Photographs of all boards by one camera of a seeded rig, and the camera as it is."""
+    """Photographs of all boards by one camera of a seeded rig, and the camera as it is; taken once."""
+    return _boards(seed, rig.model_dump_json(), camera)
+
+
+@cache
+def _boards(seed: int, rig_json: str, camera: int) -> tuple[Targets, list[F32], PinholeCamera]:
+    rig = TwinRigConfig.model_validate_json(rig_json)
     actual = actual_rig(rig, seed)
     targets, _ = make_targets(rig, camera)
     source = TargetSource(targets, actual.cameras[camera], actual, rig.projector.beam_diameter_mm / 2)

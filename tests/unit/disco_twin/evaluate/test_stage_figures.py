@@ -1,0 +1,132 @@
+"""Figures of each stage: nothing for outputs that are the truth, and the size of an error that was put in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from calibrate_twin import faulty_rig, world
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from disco_twin.camera.lars3 import lars3_sensor
+from disco_twin.evaluate.budget import true_calibration
+from disco_twin.evaluate.stage_figures import StageOutputs, TrueRun, all_figures
+from disco_twin.faults.actual_rig import actual_rig
+from disco_twin.light.balance import EnergyBalance
+from disco_twin.light.truth import Truth
+from pipeline.calibrate.calibration import Calibration, nominal_calibration, pose_rows
+from pipeline.geometry.mesh import vertex_areas
+from pipeline.reconstruct.samples.distances import beam_footprints
+from pipeline.reconstruct.samples.spots import locate_spots
+from pipeline.reconstruct.settings import ReconstructConfig
+
+F64 = NDArray[np.float64]
+COLUMNS = np.arange(5, 1500, 100)
+
+
+@cache
+def perfect() -> tuple[StageOutputs, TrueRun]:
+    """The quick scene before a rig that is off, R_d that falls with distance, and outputs without any error."""
+    rig, scan, plan = faulty_rig(), world().scan, world().plan
+    calibration = true_calibration(rig, actual_rig(rig, 3), nominal_calibration(rig, lars3_sensor(rig)))
+    spots = locate_spots(scan, calibration, plan, ReconstructConfig())
+    distance = np.linalg.norm(scan.vertices[COLUMNS, None] - scan.vertices, axis=2)
+    mean = np.stack([np.exp(-distance / length) / length**2 for length in (3.0, 4.0, 5.0)])
+    zero: Any = np.zeros(3)
+    balance = EnergyBalance(**dict.fromkeys(EnergyBalance.__dataclass_fields__, zero))
+    truth = Truth(COLUMNS, mean, 1e-6 * mean, vertex_areas(scan), balance)
+    values = np.full((3, len(plan.spots), len(scan.vertices)), np.nan)
+    values[:, :, COLUMNS] = np.stack([beam_footprints(scan, spots) @ column.T for column in mean])
+    image = np.random.default_rng(1).uniform(1.0, 2.0, (3, 12, 16))
+    hits = np.where(spots.transmitted[:, None] > 0, spots.position, np.nan)
+    key, mask = ("uniform", "left"), np.ones((12, 16), bool)
+    true = TrueRun(scan, plan, calibration, hits, truth, {key: np.stack([image, image])}, {"left": mask})
+    return StageOutputs(calibration, spots, values, mean, {key: image}), true
+
+
+def moved(calibration: Calibration, views: F64, projectors: F64) -> Calibration:
+    """All views' and all projectors' poses after a (4, 4) motion of the object."""
+    turned = [np.array(v.object_to_camera) @ views for v in calibration.views]
+    aimed = [np.array(p.object_to_projector) @ projectors for p in calibration.projectors]
+    pairs = zip(calibration.views, turned, strict=True)
+    both = zip(calibration.projectors, aimed, strict=True)
+    return calibration.model_copy(
+        update={
+            "views": tuple(v.model_copy(update={"object_to_camera": pose_rows(x)}) for v, x in pairs),
+            "projectors": tuple(p.model_copy(update={"object_to_projector": pose_rows(x)}) for p, x in both),
+        }
+    )
+
+
+def motion(rotation: tuple[float, float, float] = (0, 0, 0), shift: tuple[float, float, float] = (0, 0, 0)) -> F64:
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(rotation).as_matrix()
+    matrix[:3, 3] = shift
+    return matrix
+
+
+def changed(**outputs: Any) -> dict[str, float]:
+    """The figures that are no longer those of perfect outputs."""
+    perfect_outputs, true = perfect()
+    before = all_figures(perfect_outputs, true)
+    after = all_figures(replace(perfect_outputs, **outputs), true)
+    return {name: value for name, value in after.items() if abs(value - before[name]) > 1e-3}
+
+
+def test_outputs_without_error_have_none() -> None:
+    figures = all_figures(*perfect())
+    assert {name.split("/")[0] for name in figures} == {"pose", "projector", "spots", "samples", "completion", "relit"}
+    assert max(abs(value) for value in figures.values()) < 1e-6, figures
+
+
+def test_a_lens_that_is_taken_for_another_is_an_error_of_the_pose() -> None:
+    """A pixel of the image's centre is 44 um behind a lens of 62 mm: so many mm at the object's distance."""
+    outputs, _ = perfect()
+    own = outputs.calibration
+    views = tuple(v.model_copy(update={"centre_px": (v.centre_px[0] + 1.0, v.centre_px[1])}) for v in own.views)
+    distance = np.mean([np.linalg.norm(own.view_camera(v).position) for v in range(len(views))])
+    found = changed(calibration=own.model_copy(update={"views": views}))
+    assert found == {"pose/image mm": pytest.approx(0.044 / 62.0 * distance, rel=0.02)}
+
+
+def test_a_frame_that_is_turned_for_cameras_and_projector_alike_is_an_error_of_the_frame_alone() -> None:
+    outputs, true = perfect()
+    turned = motion(rotation=(0.01, 0.0, 0.0))
+    found = changed(calibration=moved(outputs.calibration, turned, turned))
+    from_axis = np.sqrt((true.scan.vertices[:, 1:] ** 2).sum(axis=1).mean())
+    assert found == {"pose/frame mm": pytest.approx(0.01 * from_axis, rel=1e-3)}
+
+
+def test_a_projector_that_stands_elsewhere_misses_by_as_much() -> None:
+    outputs, _ = perfect()
+    found = changed(calibration=moved(outputs.calibration, motion(), motion(shift=(0.0, 0.0, 0.5))))
+    assert found == {"projector/aim mm": pytest.approx(0.5, rel=0.05)}  # across the beams, which come from the side
+
+
+def test_errors_of_spots_samples_entries_and_images_have_their_size() -> None:
+    outputs, _ = perfect()
+    found = changed(spots=replace(outputs.spots, position=outputs.spots.position + np.array([0.0, 0.3, 0.0])))
+    assert found.pop("spots/place mm") == pytest.approx(0.3)
+    assert all(name.startswith("samples/") for name in found)  # they are then said of other places
+    for stage, change in (
+        ("samples", {"values": 10**0.1 * outputs.values}),
+        ("completion", {"reflectance": 10**0.1 * outputs.reflectance}),
+    ):
+        found = changed(**change)
+        assert found == dict.fromkeys(found, pytest.approx(0.1, abs=1e-4))
+        assert len(found) == (6 if stage == "samples" else 8)
+        assert all(name.startswith(stage) for name in found)
+    found = changed(images={key: 1.1 * image for key, image in outputs.images.items()})
+    assert found == dict.fromkeys(("relit/uniform@left nrmse", "relit/uniform@left energy - 1"), pytest.approx(0.1))
+
+
+def test_what_was_not_observed_or_is_not_positive_is_no_perfect_sample() -> None:
+    outputs, _ = perfect()
+    found = changed(values=np.where(np.isfinite(outputs.values), -1.0, np.nan))
+    assert found["samples/decade 0 log10 rmse"] == pytest.approx(1.0)  # a decade off
+    found = changed(values=np.full_like(outputs.values, np.nan))
+    assert found["samples/decade 0 log10 rmse"] == np.inf
