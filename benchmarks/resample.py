@@ -50,7 +50,7 @@ def run(quick: bool = False) -> dict[str, Any]:
             camera = calibration.view_camera(view)
             readings.append({"footprint": footprint_reading(mesh, camera, ETA, MAX_VIEW_DEG)})
         cpu = (time.process_time() - cpu) / plan.views
-        sights = [ViewReader.of(view, calibration, mesh, readings[view]) for view in range(plan.views)]
+        readers = [ViewReader.of(view, calibration, mesh, readings[view]) for view in range(plan.views)]
         lit = np.ones(len(plan.spots))
         figures: dict[str, list[float]] = {}
 
@@ -71,15 +71,15 @@ def run(quick: bool = False) -> dict[str, Any]:
                     np.copyto(target, source)
 
             for _ in range(rounds):
-                note("", len(some), lambda: [None for _ in resample(stream, calibration, sights, lit, {})])
+                note("", len(some), lambda: [None for _ in resample(stream, calibration, readers, lit, {})])
                 note("copy_", len(some), copy)
                 note("decode_", len(some), lambda: [None for _ in stream.read_many(some, usable_cores())])
                 note("plain_", len(few), lambda: [plain(stream, calibration, readings, i) for i in few])
-            part = next(iter(resample(stream, calibration, sights[:1], lit, {})))
-            error = error_over_noise(part, stream, calibration, readings)
+            first = next(iter(resample(stream, calibration, readers[:1], lit, {})))
+            error = error_over_noise(first, stream, calibration, readings)
     result: dict[str, Any] = {
         "images": len(some),
-        "views": len(sights),
+        "views": len(readers),
         "vertices": len(mesh.vertices),
         "width": rig.cameras[0].width,
         "height": rig.cameras[0].height,
@@ -123,14 +123,14 @@ def plain(stream: StreamReader, calibration: Any, readings: Any, index: int) -> 
     return readings[address.view]["footprint"].operator @ image.radiance.ravel().astype(np.float64) * scale
 
 
-def error_over_noise(part: BatchResult, stream: StreamReader, calibration: Any, readings: Any) -> float:
+def error_over_noise(result: BatchResult, stream: StreamReader, calibration: Any, readings: Any) -> float:
     """Largest deviation of a reading from the plain one, in standard deviations of that reading."""
-    sight, worst = part.task.sight, 0.0
-    rows = sight.rows["footprint"]
-    operator = readings[sight.view]["footprint"].operator[rows]
-    for value, scale, address in zip(part.value["footprint"], part.scale, part.task.addresses, strict=True):
+    reader, worst = result.batch.reader, 0.0
+    rows = reader.rows["footprint"]
+    operator = readings[reader.view]["footprint"].operator[rows]
+    for value, scale, address in zip(result.value["footprint"], result.scale, result.batch.addresses, strict=True):
         index = stream.plan.index(address)
-        image = calibration.radiance(stream.read(index), sight.view, address.laser)
+        image = calibration.radiance(stream.read(index), reader.view, address.laser)
         variance = operator.multiply(operator) @ image.variance.ravel().astype(np.float64) * scale**2
         exact = plain(stream, calibration, readings, index)[rows]
         worst = max(worst, float(np.nanmax(np.abs(value - exact) / np.sqrt(variance))))

@@ -51,7 +51,7 @@ PLATE_SPOT_MM = 0.05  # how well a spot's place on the white plate is seen
 
 
 @dataclass(frozen=True)
-class Measured:
+class RigMeasurement:
     """The calibration, and what each stage says about itself."""
 
     calibration: Calibration
@@ -62,7 +62,7 @@ class Measured:
     response: Response | None = None  # None: the camera is linear
 
 
-def measure(capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh) -> Measured:
+def measure(capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh) -> RigMeasurement:
     """All stages. `mesh`: the scan, object frame, mm."""
     response = measure_response(capture, rig, sensor) if rig.sensor.response == "curved" else None
     if response is not None:
@@ -80,7 +80,7 @@ def measure(capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh
         watts = mean_power(stream)
     for text in poses.ambiguity:
         log.warning("the silhouettes leave open: %s", text)
-    return Measured(assemble(rig, sensor, cameras, poses, fit, watts), tuple(cameras), poses, fit, size, response)
+    return RigMeasurement(assemble(rig, sensor, cameras, poses, fit, watts), tuple(cameras), poses, fit, size, response)
 
 
 def measure_poses(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from pipeline.calibrate.calibrate_rig import Measured
+    from pipeline.calibrate.calibrate_rig import RigMeasurement
     from pipeline.calibrate.pose import PoseFit
     from pipeline.calibrate.projector_fit import ProjectorFit
     from pipeline.calibrate.target_images import CameraImages
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 F64 = NDArray[np.float64]
 
 
-def figures(found: Measured) -> dict[str, Any]:
+def figures(found: RigMeasurement) -> dict[str, Any]:
     """Strict JSON, without NaN."""
     views = found.calibration.views
     per_camera = len(views) // len(found.cameras)
@@ -60,7 +60,7 @@ def _lens(name: str, images: CameraImages) -> dict[str, Any]:
     }
 
 
-def _response(found: Measured) -> dict[str, Any] | None:
+def _response(found: RigMeasurement) -> dict[str, Any] | None:
     """Of a camera that is not linear: error as a share of the exposure, at worst above a fiftieth of the range."""
     if found.response is None:
         return None
@@ -73,7 +73,7 @@ def _response(found: Measured) -> dict[str, Any] | None:
     }
 
 
-def _photometric(found: Measured, names: Sequence[str]) -> dict[str, Any]:
+def _photometric(found: RigMeasurement, names: Sequence[str]) -> dict[str, Any]:
     """Per laser, and the white balance per camera; drift and scatter are shares, the largest of all cameras."""
     balances = [c.balance for c in found.cameras]
     return {

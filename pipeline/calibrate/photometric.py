@@ -34,7 +34,7 @@ class Places:
 
 
 @dataclass(frozen=True)
-class Balance:
+class WhiteBalance:
     """factor: (L,) what radiances are to be multiplied with, so that they agree with the photodiode; error: (L,) of it.
 
     Light that the lens throws outside the image is part of the factor: images of the object lose the same share. The
@@ -65,7 +65,7 @@ def pixel_areas(camera: PinholeCamera, plane: F64) -> F64:
     return np.asarray((depth**2 / camera.focal.prod() / slope).reshape(camera.height, camera.width))
 
 
-def balance(light: F64, reading: F64, share: F64, place: NDArray[np.int64]) -> Balance:
+def balance(light: F64, reading: F64, share: F64, place: NDArray[np.int64]) -> WhiteBalance:
     """light: (L, N) sums of radiance times area in W/sr; reading: (L, N) photodiode, W; share: (L,) of the plate.
 
     place: (N,) which exposures were made in one place of the plate; a plate's pose errs for all of them alike
@@ -82,10 +82,10 @@ def balance(light: F64, reading: F64, share: F64, place: NDArray[np.int64]) -> B
     weight = 1.0 / np.maximum(scatter, 1e-6) ** 2  # light without any noise, as in a test, has a scatter of zero
     found = Places(weight @ (mean / value[:, None]) / weight.sum(), 1.0 / (weight.sum() * count), count / number)
     drift = (light.max(axis=1) - light.min(axis=1)) / light.mean(axis=1)
-    return Balance(1.0 / value, scatter / (np.sqrt(number) * value), drift, scatter, found)
+    return WhiteBalance(1.0 / value, scatter / (np.sqrt(number) * value), drift, scatter, found)
 
 
-def with_places(balances: Sequence[Balance]) -> list[Balance]:
+def with_places(balances: Sequence[WhiteBalance]) -> list[WhiteBalance]:
     """The white balances of all cameras, their errors with that of the plate's poses.
 
     That one is alike for all exposures and lasers of a place, and of one standard deviation for all places and cameras.

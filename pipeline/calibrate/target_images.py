@@ -14,7 +14,7 @@ from hw.base.errors import DiscoError, InputError
 from hw.record import RawImage, Sensor, to_radiance
 from pipeline.calibrate.intrinsics import Intrinsics, board_pose, find_corners, fit_intrinsics
 from pipeline.calibrate.peaks import find_peak, seen
-from pipeline.calibrate.photometric import Balance, balance, pixel_areas
+from pipeline.calibrate.photometric import WhiteBalance, balance, pixel_areas
 from pipeline.calibrate.response import Response, fit_response
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.nominal_rig import RigConfig
@@ -33,7 +33,7 @@ class CameraImages:
 
     lens: PinholeCamera  # nominal place, measured lens
     intrinsics: Intrinsics
-    balance: Balance
+    balance: WhiteBalance
     plate_points: F64  # (N, 3) mm, spots on the white plate in the camera's frame
     plate_steps: F64  # (N, 2)
 
@@ -100,8 +100,8 @@ def read_targets(folder: Path, rig: RigConfig, camera: int, sensor: Sensor) -> C
 
 def _plates(
     stream: StreamReader, targets: Targets, sensor: Sensor, lens: PinholeCamera, poses: dict[int, F64], rig: RigConfig
-) -> tuple[Balance, F64, F64]:
-    """Balance, and the spots' (N, 3) places in the camera's frame with their (N, 2) steps."""
+) -> tuple[WhiteBalance, F64, F64]:
+    """White balance, and the spots' (N, 3) places in the camera's frame with their (N, 2) steps."""
     plan, lasers = stream.plan, stream.plan.lasers
     gain = 1.0 / lens.illumination()
     light: list[list[float]] = []

@@ -39,7 +39,7 @@ class RigMoved(DiscoError):
 
 
 @dataclass(frozen=True)
-class Comparison:
+class SpotComparison:
     """Now against then. power, radiance: ratios (radiance per watt); shift_px: (right, down); pattern: share of rms."""
 
     power: float
@@ -77,7 +77,7 @@ class _Reference:
     significance: float
 
 
-def require_unmoved(rig: Rig, stored: StreamReader, sensor: Sensor) -> list[Comparison]:
+def require_unmoved(rig: Rig, stored: StreamReader, sensor: Sensor) -> list[SpotComparison]:
     """Shoot a stored spot of every laser again; refuse to go on if one differs, or if none is bright enough to tell.
 
     A laser whose spots are all dim among bright ones is compared by its power alone: that mirrors and object are where
@@ -128,7 +128,7 @@ def _shoot(rig: Rig, stored: StreamReader, address: ImageAddress) -> tuple[RawIm
     return raw, power
 
 
-def _require_same(rig: Rig, stored: StreamReader, sensor: Sensor, then: _Reference) -> Comparison:
+def _require_same(rig: Rig, stored: StreamReader, sensor: Sensor, then: _Reference) -> SpotComparison:
     """Shoot one reference again."""
     plan, address, meta = stored.plan, then.address, stored.meta(then.address)
     raw, power = _shoot(rig, stored, address)
@@ -171,7 +171,7 @@ def _bright(stored: StreamReader, sensor: Sensor, index: int) -> _Reference | No
     return _Reference(address, radiance, variance, significance) if significance > BRIGHT_SIGMA else None
 
 
-def compare(then: F64, now: F64, variance: F64, power: float) -> Comparison:
+def compare(then: F64, now: F64, variance: F64, power: float) -> SpotComparison:
     """(H, W) radiances per watt, variance of their difference, ratio of the powers.
 
     Shift and brightness together by Gauss-Newton on now(x) = g then(x - d) (Lucas and Kanade 1981), both images a
@@ -191,7 +191,7 @@ def compare(then: F64, now: F64, variance: F64, power: float) -> Comparison:
     rest = now - gain * ndimage.shift(then, shift, order=3, mode="nearest")
     unexplained = max(0.0, float((rest**2).mean() - variance.mean()))
     pattern = float(np.sqrt(unexplained / max(float((now**2).mean()), 1e-300)))
-    return Comparison(power, gain, (float(shift[1]), float(shift[0])), pattern)
+    return SpotComparison(power, gain, (float(shift[1]), float(shift[0])), pattern)
 
 
 def _whole_pixels(then: F64, now: F64) -> F64:

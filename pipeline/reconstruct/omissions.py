@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.calibrate.calibration import Calibration
 from pipeline.geometry.mesh import RayMesh
-from pipeline.reconstruct.global_term.radial_profile import Measured
+from pipeline.reconstruct.global_term.radial_profile import LaserSamples
 from pipeline.reconstruct.samples.samples import Samples
 
 LOCAL_SHARE = 0.99  # of the observed light within one edge: nothing is left for a global term
@@ -33,7 +33,7 @@ def share_within_an_edge(samples: Samples) -> float:
     edge = float(samples.mesh.edges_unique_length.mean())
     near = samples.spot_pairs.distance < edge + samples.spots.beam_radius
     area = RayMesh.of(samples.mesh).vertex_areas
-    power = np.stack([Measured.of(samples, k).value * area for k in range(len(samples.values))])
+    power = np.stack([LaserSamples.of(samples, k).value * area for k in range(len(samples.values))])
     return float(power[:, near].sum() / max(power.sum(), 1e-30))
 
 

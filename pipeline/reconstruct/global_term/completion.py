@@ -4,7 +4,7 @@ R_d(x_i, x_o) = [mean of f(distance) over the patches] * exp(s(distance) G(x_i, 
 all samples, s the size of what it leaves unexplained, and G a smooth symmetric function on pairs of surface points.
 G solves one symmetric positive definite system: the samples at the spots' barycentric points bind columns and, by
 reciprocity, rows; smoothness over the surface on both sides fills the rest. Values are compared with their expectation
-linearly and weighted by precision (`Measured.residual`), so that a noisy tail neither dominates nor turns negative.
+linearly and weighted by precision (`LaserSamples.residual`), so that a noisy tail neither dominates nor turns negative.
 
 The fit fills what was not measured. An entry next to a spot holds the sample itself, as far as its noise
 allows (`hold_measured`): fill overwrites nothing that was measured (docs/decisions/0013).
@@ -24,9 +24,9 @@ from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.boundary_fit import measure_boundary
 from pipeline.reconstruct.global_term.harmonics import Harmonics, harmonics
-from pipeline.reconstruct.global_term.radial_profile import Measured, Tilt, fit_profile
+from pipeline.reconstruct.global_term.radial_profile import DirectionBias, LaserSamples, fit_profile
 from pipeline.reconstruct.samples.samples import ANGULAR, Samples, SpotSumImage
-from pipeline.reconstruct.samples.spots import outward_tilt
+from pipeline.reconstruct.samples.spots import forward_component
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -109,13 +109,13 @@ class Fit:
 
     entries: F64
     at_spots: F64
-    direction_bias: Tilt
+    direction_bias: DirectionBias
     field: F32
 
 
 def fit_laser(samples: Samples, laser: int, field: SymmetricField, start: F32) -> Fit:
     """The profile and the field in turn. start: (n, n) first guess of Y, the laser's before."""
-    pairs, vertex_pairs, measured = samples.spot_pairs, samples.vertex_pairs, Measured.of(samples, laser)
+    pairs, vertex_pairs, measured = samples.spot_pairs, samples.vertex_pairs, LaserSamples.of(samples, laser)
     edge = float(samples.mesh.edges_unique_length.mean())
     scale, y, profile = deviation(measured.edges), start, None
     smooth = scale * field.at_spots(y)
@@ -157,7 +157,7 @@ def hold_measured(
     squared, measured_in_all = share.multiply(share).tocsr(), measured_entries(samples)
     entries, variances = [], []
     for laser, fit in enumerate(fits):
-        measured = Measured.of(samples, laser)
+        measured = LaserSamples.of(samples, laser)
         expected = fit.at_spots * np.exp(fit.direction_bias(samples.spot_pairs.distance) * samples.direction_bias)
         variance = measured.variance(expected)
         weight = np.where(measured.observed, 1.0 / (variance + ANGULAR**2), 0.0)
@@ -218,7 +218,7 @@ def complete(samples: Samples) -> RelightableModel:
     )
 
     def expected(view: SpotSumImage) -> F64:
-        direction_bias = sum(outward_tilt(samples.mesh, samples.spots, view.camera.position))
+        direction_bias = sum(forward_component(samples.mesh, samples.spots, view.camera.position))
         distance = samples.spot_pairs.distance
         return np.stack([fit.at_spots * np.exp(fit.direction_bias(distance) * direction_bias) for fit in fits])
 

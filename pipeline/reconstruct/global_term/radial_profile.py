@@ -26,12 +26,12 @@ SCATTER_EDGES = 3.0
 OUTLIER = 3.0  # standard deviations from which on a value counts less (Huber)
 LARGEST_STEP = 2.0  # relative: what lies further from its expectation is taken to lie here
 ITERATIONS = 12
-TILT_EDGES = (0.5, 2.0, 4.5, 10.0)
+BIAS_EDGES = (0.5, 2.0, 4.5, 10.0)
 ENOUGH = 3e-3  # change of log f at which the fit ends
 
 
 @dataclass(frozen=True)
-class Measured:
+class LaserSamples:
     """One laser's samples, (S, V) each.
 
     value: mm^-2, 0 where unobserved; observed; dark: variance without signal, mm^-4; noise: variance per signal, mm^-2;
@@ -46,7 +46,7 @@ class Measured:
     edges: F64
 
     @classmethod
-    def of(cls, samples: Samples, laser: int) -> Measured:
+    def of(cls, samples: Samples, laser: int) -> LaserSamples:
         """One laser's part of the samples."""
         observed = np.isfinite(samples.values[laser])
         value, dark, noise = (
@@ -103,7 +103,7 @@ def _knots(edge: float, largest: float) -> F64:
     return np.concatenate([np.zeros(4), inner, outer[:-1], np.repeat(outer[-1], 4)])
 
 
-def _start(profile: Profile, measured: Measured, distance: F64) -> F64:
+def _start(profile: Profile, measured: LaserSamples, distance: F64) -> F64:
     """Coefficients through the logarithms of means over bins of distance."""
     edges = np.quantile(distance[measured.observed], np.linspace(0, 1, 41))
     bin_of = np.clip(np.searchsorted(edges, distance) - 1, 0, 39)
@@ -119,11 +119,11 @@ def _start(profile: Profile, measured: Measured, distance: F64) -> F64:
 
 
 @dataclass(frozen=True)
-class Tilt:
-    """log R_d seen in a direction is that over all directions + slope(distance) * `outward_tilt`.
+class DirectionBias:
+    """log R_d seen in a direction is that over all directions + slope(distance) * `forward_component`.
 
     Light that has not lost its direction leaves ahead: more is seen along its way than against it, and on a convex
-    object cameras look against it. `slopes` are at TILT_EDGES edges of length `edge` (mm), linear in log distance.
+    object cameras look against it. `slopes` are at BIAS_EDGES edges of length `edge` (mm), linear in log distance.
     """
 
     edge: float
@@ -132,7 +132,7 @@ class Tilt:
     @staticmethod
     def basis(distance: F64, edge: float) -> F64:
         """(..., 4) hat functions of log distance."""
-        knots = np.log(edge * np.array(TILT_EDGES))
+        knots = np.log(edge * np.array(BIAS_EDGES))
         at = np.log(np.maximum(distance, 0.1 * edge))
         return np.stack([np.interp(at, knots, one) for one in np.eye(len(knots))], axis=-1)
 
@@ -143,12 +143,12 @@ class Tilt:
 
 def fit_profile(
     pairs: Pairs,
-    measured: Measured,
+    measured: LaserSamples,
     edge: float,
     direction_bias: F64,
     offset: F64 | float = 0.0,
     start: Profile | None = None,
-) -> tuple[Profile, Tilt]:
+) -> tuple[Profile, DirectionBias]:
     """Fit f and the tilt's slopes so that exp(offset + slope * tilt) * (mean of f over the patches) meets the values.
 
     tilt: (S, V) of the samples; offset: (S, V) or 0; start: a first guess. f is the mean over all directions.
@@ -157,7 +157,7 @@ def fit_profile(
     profile = start or Profile(knots, _start(Profile(knots, np.zeros(len(knots) - 4)), measured, pairs.distance))
     near_basis, basis = profile.basis(pairs.centres), profile.basis(pairs.distance)
     n = basis.shape[2]
-    leaning = Tilt.basis(pairs.distance, edge) * direction_bias[:, :, None]
+    leaning = DirectionBias.basis(pairs.distance, edge) * direction_bias[:, :, None]
     slopes = np.zeros(leaning.shape[2])
     bend = np.diff(np.eye(n), 2, axis=0)
     prior = Prior(np.zeros(n + len(slopes)), block_diag(bend.T @ bend, np.eye(len(slopes))))
@@ -174,15 +174,15 @@ def fit_profile(
         profile, slopes = Profile(knots, now[:n] + step[:n]), now[n:] + step[n:]
         if np.abs(step).max() < ENOUGH:
             break
-    return profile, Tilt(edge, slopes)
+    return profile, DirectionBias(edge, slopes)
 
 
-def over_directions(samples: Samples, laser: int) -> tuple[Measured, Profile]:
+def over_directions(samples: Samples, laser: int) -> tuple[LaserSamples, Profile]:
     """One laser's samples with the direction's factor taken out, and the profile: what the simple models are fitted to.
 
     They know nothing of directions; a mean over those that the cameras happened to look from would be too low.
     """
-    measured = Measured.of(samples, laser)
+    measured = LaserSamples.of(samples, laser)
     edge = float(samples.mesh.edges_unique_length.mean())
     profile, direction_bias = fit_profile(samples.spot_pairs, measured, edge, samples.direction_bias)
     return replace(

@@ -43,8 +43,8 @@ class ViewReader:
     """What the images of one view have in common.
 
     window: (rows, columns) of the image that show the object
-    rows: per way of reading, (n,) the vertices that are seen well enough
-    operators: per way, (n, h * w) float32, radiance in the window without the lens's gain -> their readings
+    rows: per sampling, (n,) the vertices that are seen well enough
+    operators: per sampling, (n, h * w) float32, radiance in the window without the lens's gain -> their readings
     gain: (h, w) by which the lens makes the radiance appear too low
     """
 
@@ -58,15 +58,18 @@ class ViewReader:
     def of(
         cls, view: int, calibration: Calibration, mesh: trimesh.Trimesh, readings: Mapping[str, ImageOperator]
     ) -> ViewReader:
-        """The sight of a view by all ways of reading it."""
+        """The reader of a view for each sampling of `readings`."""
         camera = calibration.view_camera(view)
-        part = window(mesh, camera)
-        gain = 1.0 / calibration.vignetting(view)[part]
-        inside = np.arange(camera.height * camera.width).reshape(camera.height, camera.width)[part].ravel()
+        shown = window(mesh, camera)
+        gain = 1.0 / calibration.vignetting(view)[shown]
+        inside = np.arange(camera.height * camera.width).reshape(camera.height, camera.width)[shown].ravel()
         lens = sparse.diags_array(gain.ravel())
-        rows = {way: np.flatnonzero(reading.share > MIN_SHARE) for way, reading in readings.items()}
-        operators = {way: _single(reading.operator[rows[way]][:, inside] @ lens) for way, reading in readings.items()}
-        return cls(view, part, rows, operators, gain)
+        rows = {sampling: np.flatnonzero(reading.share > MIN_SHARE) for sampling, reading in readings.items()}
+        operators = {
+            sampling: _single(reading.operator[rows[sampling]][:, inside] @ lens)
+            for sampling, reading in readings.items()
+        }
+        return cls(view, shown, rows, operators, gain)
 
 
 @dataclass
@@ -122,23 +125,23 @@ class Sums:
 class Batch:
     """Images of one view and laser."""
 
-    sight: ViewReader
+    reader: ViewReader
     laser: int
     addresses: Sequence[ImageAddress]
 
 
 @dataclass
 class BatchResult:
-    """What came of a task.
+    """What came of a batch.
 
-    value: per way, (n, rows) readings in mm^-2; NaN where an image is lost, saturated or hidden by a highlight
-    alone: per way, (2, rows) noise and shot variance in mm^-4 of images of which some readings are NaN; the sums of
-        noise and shot are without them
+    value: per sampling, (n, rows) readings in mm^-2; NaN where an image is lost, saturated or hidden by a highlight
+    alone: per sampling, (2, rows) noise and shot variance in mm^-4 of images of which some readings are NaN; `sums`
+        holds those of the other images
     scale: (n,) pi / (F_t(w_i) Phi) of each image, times the camera's factor to the photodiode; 0 where it is lost
     saturated: pixels; hidden: readings that a highlight alone has cost
     """
 
-    task: Batch
+    batch: Batch
     value: dict[str, F32]
     alone: dict[str, F64]
     scale: F64
@@ -148,16 +151,16 @@ class BatchResult:
     hidden: int = 0
 
     @classmethod
-    def of(cls, task: Batch) -> BatchResult:
+    def of(cls, batch: Batch) -> BatchResult:
         """Nothing read yet."""
-        count = len(task.addresses)
-        rows = {way: len(vertices) for way, vertices in task.sight.rows.items()}
+        count = len(batch.addresses)
+        rows = {sampling: len(vertices) for sampling, vertices in batch.reader.rows.items()}
         return cls(
-            task,
-            {way: np.full((count, n), np.nan, np.float32) for way, n in rows.items()},
-            {way: np.zeros((2, n)) for way, n in rows.items()},
+            batch,
+            {sampling: np.full((count, n), np.nan, np.float32) for sampling, n in rows.items()},
+            {sampling: np.zeros((2, n)) for sampling, n in rows.items()},
             np.zeros(count),
-            Sums.zeros(task.sight.gain.shape, np.float32),
+            Sums.zeros(batch.reader.gain.shape, np.float32),
         )
 
 
@@ -179,81 +182,85 @@ def look_up(sensor: Sensor, laser: int) -> tuple[F32, F32]:
 def resample(
     stream: StreamReader,
     calibration: Calibration,
-    sights: Sequence[ViewReader],
+    readers: Sequence[ViewReader],
     transmitted: F64,
     hidden: Mapping[tuple[int, int], NDArray[np.int64]],
 ) -> Iterator[BatchResult]:
-    """Every spot image once, by all cores, in parts whose order is always the same.
+    """Read every spot image once, on all cores; the results come in one order always.
 
     transmitted: (S,) F_t(w_i) of the spots; images of spots where it is 0 are not read
     hidden: (view, spot) -> vertices that are not read, if any
     """
     plan, tables = stream.plan, [look_up(calibration.sensor, laser) for laser in range(stream.plan.lasers)]
-    tasks = []
-    for sight in sights:
-        spots = [s for s in plan.spots_at(plan.angle_of(sight.view)) if transmitted[s] > 0]
+    batches = []
+    for reader in readers:
+        spots = [s for s in plan.spots_at(plan.angle_of(reader.view)) if transmitted[s] > 0]
         for laser in range(plan.lasers):
             for low in range(0, len(spots), TOGETHER):
-                some = [ImageAddress(sight.view, "spot", s, laser) for s in spots[low : low + TOGETHER]]
-                tasks.append(Batch(sight, laser, some))
+                some = [ImageAddress(reader.view, "spot", s, laser) for s in spots[low : low + TOGETHER]]
+                batches.append(Batch(reader, laser, some))
 
-    def work(task: Batch) -> BatchResult:
-        part, view = BatchResult.of(task), task.sight.view
-        for i, address in enumerate(task.addresses):
+    def work(batch: Batch) -> BatchResult:
+        result, view = BatchResult.of(batch), batch.reader.view
+        for i, address in enumerate(batch.addresses):
             raw = _record(stream, address, calibration.sensor)
             if raw is None:
-                part.lost.append(address)
+                result.lost.append(address)
                 continue
             power = stream.meta(address).photodiode_w
-            part.scale[i] = np.pi * calibration.factor(view, task.laser) / (transmitted[address.spot] * power)
-            _read(part, i, raw, calibration.sensor, tables[task.laser], hidden.get((task.sight.view, address.spot)))
-        return part
+            result.scale[i] = np.pi * calibration.factor(view, batch.laser) / (transmitted[address.spot] * power)
+            _read(
+                result, i, raw, calibration.sensor, tables[batch.laser], hidden.get((batch.reader.view, address.spot))
+            )
+        return result
 
     with ThreadPoolExecutor(usable_cores(), thread_name_prefix="resample") as pool:
-        yield from pool.map(work, tasks)
+        yield from pool.map(work, batches)
 
 
 def _read(
-    part: BatchResult, i: int, raw: RawImage, sensor: Sensor, table: tuple[F32, F32], hidden: NDArray[np.int64] | None
+    result: BatchResult, i: int, raw: RawImage, sensor: Sensor, table: tuple[F32, F32], hidden: NDArray[np.int64] | None
 ) -> None:
-    """Image number i of a part: every step before the next image, while it is in the cache."""
-    sight, scale = part.task.sight, part.scale[i]
-    index = raw.exponent[sight.window].astype(np.min_scalar_type(len(table[0]) - 1))
+    """Read image number i of a batch; every step before the next image, while it is in the cache."""
+    reader, scale = result.batch.reader, result.scale[i]
+    index = raw.exponent[reader.window].astype(np.min_scalar_type(len(table[0]) - 1))
     index <<= index.dtype.type(sensor.bits)
-    index |= raw.charge[sight.window]
+    index |= raw.charge[reader.window]
     place = index.astype(np.intp)
     # Scaling the tables is less work than scaling the images; all places are in range, as `_record` has seen to.
     radiance = (table[0] * np.float32(scale)).take(place, mode="clip")
     variance = (table[1] * np.float32(scale**2)).take(place, mode="clip")
-    for way, operator in sight.operators.items():
-        part.value[way][i] = operator @ radiance.reshape(-1)
+    for sampling, operator in reader.operators.items():
+        result.value[sampling][i] = operator @ radiance.reshape(-1)
     full = None
     if raw.charge.max() >= sensor.saturation_dn:
-        part.saturated += int((raw.charge >= sensor.saturation_dn).sum())
-        full = (raw.charge[sight.window] >= sensor.saturation_dn).reshape(-1).astype(np.float32)
+        result.saturated += int((raw.charge >= sensor.saturation_dn).sum())
+        full = (raw.charge[reader.window] >= sensor.saturation_dn).reshape(-1).astype(np.float32)
     if hidden is None and full is None:
-        part.sums.add(radiance, variance)
+        result.sums.add(radiance, variance)
     else:
-        own = Sums.zeros(sight.gain.shape)
+        own = Sums.zeros(reader.gain.shape)
         own.add(radiance, variance)
-        part.sums.glow += radiance
-        for way in sight.operators:
-            _read_in_part(part, i, way, own, full, hidden)
+        result.sums.glow += radiance
+        for sampling in reader.operators:
+            _read_in_part(result, i, sampling, own, full, hidden)
 
 
 def _read_in_part(
-    part: BatchResult, i: int, way: str, own: Sums, full: F32 | None, hidden: NDArray[np.int64] | None
+    result: BatchResult, i: int, sampling: str, own: Sums, full: F32 | None, hidden: NDArray[np.int64] | None
 ) -> None:
-    """Blank what an image cannot tell; its noise is read for the rest alone, since sums forget for which vertices."""
-    sight = part.task.sight
-    operator, rows = sight.operators[way], sight.rows[way]
+    """Blank the vertices that an image does not show. The noise of the others is kept apart, vertex by vertex: the sums
+    over images cannot leave vertices out.
+    """
+    reader = result.batch.reader
+    operator, rows = reader.operators[sampling], reader.rows[sampling]
     touched = np.zeros(len(rows), bool) if full is None else abs(operator) @ full > 0
     masked = np.isin(rows, [] if hidden is None else hidden) & ~touched
     read = np.flatnonzero(~touched & ~masked)
     squared = operator[read].multiply(operator[read])
-    part.alone[way][:, read] += squared @ own.noise_variance().ravel(), squared @ own.shot.ravel()
-    part.value[way][i, touched | masked] = np.nan
-    part.hidden += int(masked.sum())
+    result.alone[sampling][:, read] += squared @ own.noise_variance().ravel(), squared @ own.shot.ravel()
+    result.value[sampling][i, touched | masked] = np.nan
+    result.hidden += int(masked.sum())
 
 
 def _record(stream: StreamReader, address: ImageAddress, sensor: Sensor) -> RawImage | None:

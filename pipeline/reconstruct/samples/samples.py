@@ -21,7 +21,7 @@ from pipeline.plan.plan import Plan
 from pipeline.reconstruct.samples.distances import Pairs, beam_footprints, spot_pairs, vertex_pairs
 from pipeline.reconstruct.samples.image_operators import ImageOperator
 from pipeline.reconstruct.samples.resample import BatchResult, Sums, ViewReader, look_up, resample
-from pipeline.reconstruct.samples.spots import Spots, locate_spots, outward_tilt
+from pipeline.reconstruct.samples.spots import Spots, forward_component, locate_spots
 from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.stream.stream import StreamReader
 
@@ -53,7 +53,7 @@ class Samples:
     values: (L, S, V) mm^-2, NaN where not observed; averaged over the hat function of the vertex and over the beam
     dark_variance, noise_per_signal: (L, S, V); an entry of expectation m has variance dark + per_signal * m
     oblique: (S, V) relative variance that obliqueness adds at both ends (`oblique_variance`)
-    tilt: (S, V) sum of `outward_tilt` at both ends, mean over the cameras
+    tilt: (S, V) sum of `forward_component` at both ends, mean over the cameras
     glow: per view, images summed over its spots
     """
 
@@ -107,7 +107,7 @@ def oblique_variance(cosine: NDArray[np.floating]) -> F64:
 
 
 class _Gathered:
-    """Readings of all spots by all cameras, for one way of reading.
+    """Readings of all spots by all cameras, by one sampling (footprint, bilinear).
 
     value: (L, S, C, V) mm^-2, NaN where not observed
     scale: (L, S, C) what the images' radiances were multiplied with (`Part`), 0 where one is missing
@@ -122,34 +122,34 @@ class _Gathered:
         self.scale = np.zeros((lasers, len(plan.spots), cameras))
         self.noise, self.shot, self.dark = (np.zeros((lasers, plan.views, vertices)) for _ in range(3))
 
-    def part(self, view: int) -> tuple[slice, int]:
+    def block(self, view: int) -> tuple[slice, int]:
         """(spots, camera) of a view in `value` and `scale`."""
         spots = self.plan.spots_at(self.plan.angle_of(view))
         return slice(spots.start, spots.stop), self.plan.camera_of(view)
 
-    def add(self, way: str, part: BatchResult) -> None:
+    def add(self, sampling: str, result: BatchResult) -> None:
         """What came of some images."""
-        view, laser = part.task.sight.view, part.task.laser
-        rows, camera = part.task.sight.rows[way], self.plan.camera_of(view)
-        for address, value, scale in zip(part.task.addresses, part.value[way], part.scale, strict=True):
+        view, laser = result.batch.reader.view, result.batch.laser
+        rows, camera = result.batch.reader.rows[sampling], self.plan.camera_of(view)
+        for address, value, scale in zip(result.batch.addresses, result.value[sampling], result.scale, strict=True):
             self.value[laser, address.spot, camera, rows] = value
             self.scale[laser, address.spot, camera] = scale
-        self.noise[laser, view, rows] += part.alone[way][0]
-        self.shot[laser, view, rows] += part.alone[way][1]
+        self.noise[laser, view, rows] += result.alone[sampling][0]
+        self.shot[laser, view, rows] += result.alone[sampling][1]
 
-    def add_noise(self, sight: ViewReader, way: str, laser: int, sums: Sums, dark: float) -> None:
+    def add_noise(self, reader: ViewReader, sampling: str, laser: int, sums: Sums, dark: float) -> None:
         """The sums over all images of a view and laser. dark: a dark pixel's variance before the lens's gain."""
-        rows, operator = sight.rows[way], sight.operators[way].astype(np.float64)
+        rows, operator = reader.rows[sampling], reader.operators[sampling].astype(np.float64)
         squared = operator.multiply(operator).tocsr()
-        self.noise[laser, sight.view, rows] += squared @ sums.noise_variance().ravel()
-        self.shot[laser, sight.view, rows] += squared @ sums.shot.ravel()
-        self.dark[laser, sight.view, rows] = dark * squared.sum(axis=1)
+        self.noise[laser, reader.view, rows] += squared @ sums.noise_variance().ravel()
+        self.shot[laser, reader.view, rows] += squared @ sums.shot.ravel()
+        self.dark[laser, reader.view, rows] = dark * squared.sum(axis=1)
 
     def dark_variance(self) -> F32:
         """(L, S, C, V) mm^-4, variance of the values without signal."""
         out = np.zeros_like(self.value)
         for view in range(self.plan.views):
-            spots, camera = self.part(view)
+            spots, camera = self.block(view)
             out[:, spots, camera] = self.scale[:, spots, camera, None] ** 2 * self.dark[:, view, None]
         return out
 
@@ -160,7 +160,7 @@ class _Gathered:
         """
         out = np.zeros_like(self.value)
         for view in range(self.plan.views):
-            spots, camera = self.part(view)
+            spots, camera = self.block(view)
             value = self.value[:, spots, camera]
             read = np.isfinite(value)
             total = np.where(read, np.maximum(value, 0.0), 0.0).sum(axis=1)
@@ -197,9 +197,9 @@ class _Gathered:
         shape = self.value.shape[1:]
         share, oblique, direction_bias = (np.zeros(shape, np.float32) for _ in range(3))
         for view, reading in enumerate(self.readings):
-            at = self.part(view)
+            at = self.block(view)
             share[at], oblique[at] = reading.share, oblique_variance(reading.cosine)
-            at_vertices, at_spots = outward_tilt(mesh, spots, glow[view].camera.position)
+            at_vertices, at_spots = forward_component(mesh, spots, glow[view].camera.position)
             direction_bias[at] = (at_vertices + at_spots)[at[0]]
         dark, slope = self.dark_variance(), self.noise_per_signal()
         distance = np.linalg.norm(spots.position[:, None] - np.asarray(mesh.vertices), axis=2)
@@ -232,35 +232,35 @@ def take_samples(
     readings: Mapping[str, list[ImageOperator]],
     settings: ReconstructConfig,
 ) -> tuple[dict[str, Samples], SampleStatistics]:
-    """Read every spot image once. `readings`: per way of reading, one `Reading` per view; the keys of the result."""
+    """Read every spot image once. `readings`: per sampling, one `ImageOperator` per view; the keys of the result."""
     plan, lasers = stream.plan, len(calibration.lasers)
     spots = locate_spots(mesh, calibration, plan, settings)
-    gathered = {way: _Gathered(lasers, plan, views) for way, views in readings.items()}
-    sights = [
-        ViewReader.of(view, calibration, mesh, {way: views[view] for way, views in readings.items()})
+    gathered = {sampling: _Gathered(lasers, plan, views) for sampling, views in readings.items()}
+    readers = [
+        ViewReader.of(view, calibration, mesh, {sampling: views[view] for sampling, views in readings.items()})
         for view in range(plan.views)
     ]
     glow = tuple(_no_glow(calibration.view_camera(v), lasers, len(plan.spots)) for v in range(plan.views))
-    sums = {(sight.view, laser): Sums.zeros(sight.gain.shape) for sight in sights for laser in range(lasers)}
+    sums = {(reader.view, laser): Sums.zeros(reader.gain.shape) for reader in readers for laser in range(lasers)}
     hidden = highlights(spots, calibration, plan, mesh, settings.highlight_deg)
     images, lost, saturated, masked = 0, [], 0, 0
-    for part in resample(stream, calibration, sights, spots.transmitted, hidden):
-        view, laser = part.task.sight.view, part.task.laser
-        images += len(part.task.addresses)
-        lost += [str(address) for address in part.lost]
-        saturated += part.saturated
-        masked += part.hidden
-        sums[view, laser] += part.sums
-        glow[view].included[laser, [a.spot for a in part.task.addresses]] = part.scale > 0
-        for way, g in gathered.items():
-            g.add(way, part)
+    for result in resample(stream, calibration, readers, spots.transmitted, hidden):
+        view, laser = result.batch.reader.view, result.batch.laser
+        images += len(result.batch.addresses)
+        lost += [str(address) for address in result.lost]
+        saturated += result.saturated
+        masked += result.hidden
+        sums[view, laser] += result.sums
+        glow[view].included[laser, [a.spot for a in result.batch.addresses]] = result.scale > 0
+        for sampling, g in gathered.items():
+            g.add(sampling, result)
     dark = [look_up(calibration.sensor, laser)[1].min() for laser in range(lasers)]
-    for sight in sights:
+    for reader in readers:
         for laser in range(lasers):
-            total = sums[sight.view, laser]
-            glow[sight.view].image[laser][sight.window] = total.glow * sight.gain
-            for way, g in gathered.items():
-                g.add_noise(sight, way, laser, total, float(dark[laser]))
+            total = sums[reader.view, laser]
+            glow[reader.view].image[laser][reader.window] = total.glow * reader.gain
+            for sampling, g in gathered.items():
+                g.add_noise(reader, sampling, laser, total, float(dark[laser]))
     samples = {name: g.combined(mesh, settings.eta, spots, glow) for name, g in gathered.items()}
     first = next(iter(samples.values()))
     statistics = SampleStatistics(

@@ -50,7 +50,7 @@ def locate_spots(mesh: trimesh.Trimesh, calibration: Calibration, plan: Plan, se
     return Spots(position, direction, normal, triangle, barycentric, transmitted, radius)
 
 
-def outward_tilt(mesh: trimesh.Trimesh, spots: Spots, eye: F64) -> tuple[F64, F64]:
+def forward_component(mesh: trimesh.Trimesh, spots: Spots, eye: F64) -> tuple[F64, F64]:
     """How much one looks along the light's way: (S, V) at the vertices for a camera at `eye`, (S, V) at the spots.
 
     At a vertex: component of the direction to the camera along the tangent that points away from the spot. At a spot,

@@ -19,7 +19,7 @@ from disco_twin.evaluate.budget import true_calibration
 from disco_twin.faults.actual_rig import actual_rig
 from disco_twin.faults.light_faults import LaserPower
 from disco_twin.scene.rig_schema import TwinRigConfig
-from pipeline.calibrate.calibrate_rig import Measured, measure
+from pipeline.calibrate.calibrate_rig import RigMeasurement, measure
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
 from pipeline.calibrate.figures import figures
 from pipeline.plan.plan import load_plan
@@ -36,7 +36,7 @@ class Judged:
     scores: dict[str, F64]
 
 
-def judge(found: Measured, rig: TwinRigConfig, seed: int, folder: Path) -> Judged:
+def judge(found: RigMeasurement, rig: TwinRigConfig, seed: int, folder: Path) -> Judged:
     own, actual = found.calibration, actual_rig(rig, seed)
     true = true_calibration(rig, actual, nominal_calibration(rig, lars3_sensor(rig)))
     aims = load_plan(folder / "plan.json").spots
@@ -91,12 +91,14 @@ def captured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TwinRigCon
 
 
 @pytest.fixture(scope="module")
-def measured(captured: tuple[Path, TwinRigConfig]) -> Measured:
+def measured(captured: tuple[Path, TwinRigConfig]) -> RigMeasurement:
     folder, rig = captured
     return measure(folder, rig, lars3_sensor(rig), experiment().object.mesh)
 
 
-def test_a_rig_is_calibrated_from_its_own_images(captured: tuple[Path, TwinRigConfig], measured: Measured) -> None:
+def test_a_rig_is_calibrated_from_its_own_images(
+    captured: tuple[Path, TwinRigConfig], measured: RigMeasurement
+) -> None:
     """Faults on. Expected: spots within .15 mm rms, directions within .3 degrees, white balance to .75 %."""
     (folder, rig), found = captured, measured
     judged = judge(found, rig, 11, folder)
@@ -127,7 +129,7 @@ def test_a_rig_is_calibrated_from_its_own_images(captured: tuple[Path, TwinRigCo
 
 
 def test_a_scan_in_a_frame_of_its_own_gives_the_same_projector(
-    captured: tuple[Path, TwinRigConfig], measured: Measured
+    captured: tuple[Path, TwinRigConfig], measured: RigMeasurement
 ) -> None:
     """The scan is turned by 3 degrees about the axis and stands 10 mm higher: the projector moves with it.
 

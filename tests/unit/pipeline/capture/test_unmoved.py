@@ -17,7 +17,7 @@ from hw.base.errors import DiscoError
 from hw.interface import Aim
 from hw.record import Sensor
 from pipeline.capture.loop import capture
-from pipeline.capture.unmoved import Comparison, RigMoved, compare
+from pipeline.capture.unmoved import RigMoved, SpotComparison, compare
 from pipeline.plan.plan import Plan
 from pipeline.stream.stream import StreamReader, StreamWriter
 
@@ -63,9 +63,9 @@ def test_another_pattern_in_the_same_place_is_noticed() -> None:
 @pytest.mark.parametrize("figure", [{"power": 0.7}, {"radiance": 1.2}, {"shift_px": (0.0, 0.6)}, {"pattern": 0.2}])
 def test_every_figure_has_a_tolerance_and_nan_is_beyond_it(figure: dict[str, object]) -> None:
     good: dict[str, object] = {"power": 1.0, "radiance": 1.0, "shift_px": (0.1, 0.1), "pattern": 0.05}
-    assert not Comparison(**good).moved  # type: ignore[arg-type]
-    assert Comparison(**good | figure).moved  # type: ignore[arg-type]
-    assert Comparison(**good | {"radiance": float("nan")}).moved  # type: ignore[arg-type]
+    assert not SpotComparison(**good).moved  # type: ignore[arg-type]
+    assert SpotComparison(**good | figure).moved  # type: ignore[arg-type]
+    assert SpotComparison(**good | {"radiance": float("nan")}).moved  # type: ignore[arg-type]
 
 
 class Moved(Glow):

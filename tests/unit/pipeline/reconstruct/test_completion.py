@@ -24,7 +24,7 @@ from pipeline.reconstruct.global_term.harmonics import harmonics
 from pipeline.reconstruct.methods import reconstruct
 from pipeline.reconstruct.omissions import colour_groups, is_opaque
 from pipeline.reconstruct.samples.samples import Samples
-from pipeline.reconstruct.samples.spots import outward_tilt
+from pipeline.reconstruct.samples.spots import forward_component
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +174,7 @@ def test_the_boundary_is_compared_with_what_each_view_expects(monkeypatch: pytes
     ((_, _, _, expected),) = asked
     eyes = [np.array([300.0, 0, 0]), np.array([0, 0, -300.0])]
     views = [expected(SimpleNamespace(camera=SimpleNamespace(position=eye)))[0] for eye in eyes]
-    lean = [sum(outward_tilt(s.mesh, s.spots, eye)) for eye in eyes]
+    lean = [sum(forward_component(s.mesh, s.spots, eye)) for eye in eyes]
     ratio, difference = np.log(views[0] / views[1]), lean[0] - lean[1]
     smooth = SymmetricField.of(harmonics(s.mesh, 500), s.lit, RANGE_EDGES * float(s.mesh.edges_unique_length.mean()))
     slope = fit_laser(s, 0, smooth, np.zeros_like(smooth.penalty)).direction_bias(s.spot_pairs.distance)

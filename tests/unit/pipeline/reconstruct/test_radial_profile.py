@@ -14,15 +14,15 @@ from pipeline.reconstruct.baselines.lambertian import fit_lambertian
 from pipeline.reconstruct.global_term.completion import (
     deviation,
 )
-from pipeline.reconstruct.global_term.radial_profile import Measured, fit_profile, scatter
-from pipeline.reconstruct.samples.spots import outward_tilt
+from pipeline.reconstruct.global_term.radial_profile import LaserSamples, fit_profile, scatter
+from pipeline.reconstruct.samples.spots import forward_component
 
 
 def test_profile_is_recovered() -> None:
     made = make(noise=0.0, contrast=0.0, hidden=0.0)
     s = made.samples
     profile, _ = fit_profile(
-        s.spot_pairs, Measured.of(s, 0), float(s.mesh.edges_unique_length.mean()), s.direction_bias
+        s.spot_pairs, LaserSamples.of(s, 0), float(s.mesh.edges_unique_length.mean()), s.direction_bias
     )
     got = s.vertex_pairs.mean(profile)
     assert rmse_log10(0.5 * (got + got.T), made.truth[0]) < 0.02
@@ -86,7 +86,7 @@ def test_profile_is_that_of_all_directions() -> None:
     s = made.samples
     direction_bias = np.random.default_rng(4).uniform(-0.8, 0.2, s.values[0].shape)
     edge = float(s.mesh.edges_unique_length.mean())
-    seen = Measured.of(replace(s, values=s.values * np.exp(0.5 * direction_bias).astype(np.float32)), 0)
+    seen = LaserSamples.of(replace(s, values=s.values * np.exp(0.5 * direction_bias).astype(np.float32)), 0)
     plain, tilted = (
         s.vertex_pairs.mean(fit_profile(s.spot_pairs, seen, edge, t)[0]).sum() / made.truth[0].sum()
         for t in (np.zeros_like(direction_bias), direction_bias)
@@ -104,7 +104,7 @@ def test_tilt_has_the_sign_of_the_view() -> None:
         normal=np.array([[0, 0, 1.0]] * 2),
         direction=np.array([[0, 0, -1.0], [-0.6, 0, -0.8]]),  # the second laser stands on the +x side
     )
-    at_vertices, at_spots = outward_tilt(s.mesh, pole, np.array([1e6, 0, 0]))
+    at_vertices, at_spots = forward_component(s.mesh, pole, np.array([1e6, 0, 0]))
     x, _, z = np.asarray(s.mesh.vertices).T
     near = (z > 8) & (np.abs(x) > 2)
     np.testing.assert_array_equal(np.sign(at_vertices[0, near]), np.sign(x[near]))

@@ -58,8 +58,8 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, trimesh.Tri
 
 def readings_of(mesh: trimesh.Trimesh, calibration: Calibration, view: int) -> dict[str, ImageOperator]:
     camera = calibration.view_camera(view)
-    ways = {"footprint": footprint_reading, "bilinear": bilinear_reading}
-    return {way: reading(mesh, camera, ETA, 75.0) for way, reading in ways.items()}
+    samplings = {"footprint": footprint_reading, "bilinear": bilinear_reading}
+    return {sampling: reading(mesh, camera, ETA, 75.0) for sampling, reading in samplings.items()}
 
 
 def test_equals_the_plain_computation(capture: tuple[Path, trimesh.Trimesh, Calibration]) -> None:
@@ -72,52 +72,56 @@ def test_equals_the_plain_computation(capture: tuple[Path, trimesh.Trimesh, Cali
         plan = stream.plan
         transmitted = np.where(np.arange(len(plan.spots)) % 6 == 1, 0.0, 0.9 - 0.01 * np.arange(len(plan.spots)))
         hidden = {(v, s): np.arange(s, 160, 3) for v in range(plan.views) for s in range(0, len(plan.spots), 4)}
-        ways = [readings_of(mesh, calibration, view) for view in range(plan.views)]
-        sights = [ViewReader.of(view, calibration, mesh, ways[view]) for view in range(plan.views)]
-        parts = list(resample(stream, calibration, sights, transmitted, hidden))
-    assert {a.spot for p in parts for a in p.task.addresses} == set(np.flatnonzero(transmitted).tolist())
+        samplings = [readings_of(mesh, calibration, view) for view in range(plan.views)]
+        readers = [ViewReader.of(view, calibration, mesh, samplings[view]) for view in range(plan.views)]
+        results = list(resample(stream, calibration, readers, transmitted, hidden))
+    assert {a.spot for p in results for a in p.batch.addresses} == set(np.flatnonzero(transmitted).tolist())
     border = np.pad(np.zeros((SHAPE[0] - 2, SHAPE[1] - 2)), 1, constant_values=1.0).ravel()
     blank = 0
-    for part in parts:
-        sight = part.task.sight
+    for result in results:
+        reader = result.batch.reader
         glow = np.zeros(SHAPE)
-        noise = {way: np.zeros((2, len(rows))) for way, rows in sight.rows.items()}
-        for i, address in enumerate(part.task.addresses):
+        noise = {sampling: np.zeros((2, len(rows))) for sampling, rows in reader.rows.items()}
+        for i, address in enumerate(result.batch.addresses):
             index = plan.index(address)
-            assert (address in part.lost) == (part.scale[i] == 0.0) == (power(index) == 0.0)
+            assert (address in result.lost) == (result.scale[i] == 0.0) == (power(index) == 0.0)
             if power(index) == 0.0:
-                assert all(np.isnan(part.value[way][i]).all() for way in part.value)
+                assert all(np.isnan(result.value[sampling][i]).all() for sampling in result.value)
                 continue
-            image = calibration.radiance(record(index), sight.view, part.task.laser)
+            image = calibration.radiance(record(index), reader.view, result.batch.laser)
             scale = np.pi / (transmitted[address.spot] * power(index))
-            assert part.scale[i] == pytest.approx(scale * calibration.factor(sight.view, part.task.laser))
+            assert result.scale[i] == pytest.approx(scale * calibration.factor(reader.view, result.batch.laser))
             radiance, shot = image.radiance.astype(np.float64) * scale, image.variance.ravel() * scale**2
             glow += radiance
-            for way, rows in sight.rows.items():
-                operator = ways[sight.view][way].operator[rows]
+            for sampling, rows in reader.rows.items():
+                operator = samplings[reader.view][sampling].operator[rows]
                 unread = abs(operator) @ image.saturated.ravel().astype(float) > 0
-                unread |= np.isin(rows, hidden.get((sight.view, address.spot), []))
-                assert np.array_equal(np.isnan(part.value[way][i]), unread)
+                unread |= np.isin(rows, hidden.get((reader.view, address.spot), []))
+                assert np.array_equal(np.isnan(result.value[sampling][i]), unread)
                 blank += int(unread.sum())
                 close = 3e-6 * (abs(operator) @ abs(radiance).ravel())
-                assert (abs(part.value[way][i] - operator @ radiance.ravel())[~unread] <= close[~unread]).all()
+                assert (abs(result.value[sampling][i] - operator @ radiance.ravel())[~unread] <= close[~unread]).all()
                 squared = operator.multiply(operator)
-                noise[way] += ~unread * [squared @ noise_squared(radiance).ravel(), squared @ shot]
-        np.testing.assert_allclose(part.sums.glow * sight.gain, glow[sight.window], rtol=1e-5, atol=1e-6 * glow.max())
-        for way, operator in sight.operators.items():
+                noise[sampling] += ~unread * [squared @ noise_squared(radiance).ravel(), squared @ shot]
+        np.testing.assert_allclose(
+            result.sums.glow * reader.gain, glow[reader.window], rtol=1e-5, atol=1e-6 * glow.max()
+        )
+        for sampling, operator in reader.operators.items():
             squared = operator.multiply(operator)
-            np.testing.assert_allclose(squared @ part.sums.shot.ravel() + part.alone[way][1], noise[way][1], rtol=1e-5)
-            fast = squared @ part.sums.noise_variance().ravel() + part.alone[way][0]
+            np.testing.assert_allclose(
+                squared @ result.sums.shot.ravel() + result.alone[sampling][1], noise[sampling][1], rtol=1e-5
+            )
+            fast = squared @ result.sums.noise_variance().ravel() + result.alone[sampling][0]
             # At the image's border the plain mask sees a pixel twice; the fast way takes the next pixel's estimate.
-            inside = ways[sight.view][way].operator[sight.rows[way]] @ border == 0
+            inside = samplings[reader.view][sampling].operator[reader.rows[sampling]] @ border == 0
             assert 10 < inside.sum() <= len(fast)
             # The lens's gain is applied after the differences, not before: it is not quite constant over three pixels.
-            np.testing.assert_allclose(fast[inside], noise[way][0][inside], rtol=2e-3)
+            np.testing.assert_allclose(fast[inside], noise[sampling][0][inside], rtol=2e-3)
     assert blank > 100
-    read = [plan.index(a) for p in parts for a in p.task.addresses if power(plan.index(a)) > 0]
-    assert sum(part.saturated for part in parts) == sum(index % 5 == 0 for index in read)
-    assert 0 < sum(part.hidden for part in parts) < blank
-    assert any(part.lost for part in parts)
+    read = [plan.index(a) for p in results for a in p.batch.addresses if power(plan.index(a)) > 0]
+    assert sum(result.saturated for result in results) == sum(index % 5 == 0 for index in read)
+    assert 0 < sum(result.hidden for result in results) < blank
+    assert any(result.lost for result in results)
 
 
 def test_a_record_that_does_not_fit_the_sensor_is_refused(
@@ -125,9 +129,9 @@ def test_a_record_that_does_not_fit_the_sensor_is_refused(
 ) -> None:
     folder, mesh, calibration = capture
     ten_bits = calibration.model_copy(update={"sensor": SENSOR.__class__(**{**vars(SENSOR), "bits": 10})})
-    sight = ViewReader.of(0, calibration, mesh, readings_of(mesh, calibration, 0))
+    reader = ViewReader.of(0, calibration, mesh, readings_of(mesh, calibration, 0))
     with StreamReader(folder) as stream, pytest.raises(DiscoError, match="do not fit the sensor"):
-        list(resample(stream, ten_bits, [sight], np.ones(len(stream.plan.spots)), {}))
+        list(resample(stream, ten_bits, [reader], np.ones(len(stream.plan.spots)), {}))
 
 
 def test_noise_estimate_is_unbiased_and_blind_to_slopes() -> None:

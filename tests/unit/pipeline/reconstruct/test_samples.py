@@ -14,7 +14,7 @@ from hw.interface import Aim
 from hw.record import RawImage, Sensor
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.plan.plan import ImageAddress, Plan
-from pipeline.reconstruct.global_term.radial_profile import Measured
+from pipeline.reconstruct.global_term.radial_profile import LaserSamples
 from pipeline.reconstruct.samples.image_operators import ImageOperator
 from pipeline.reconstruct.samples.resample import Batch, BatchResult, Sums, ViewReader, _read
 from pipeline.reconstruct.samples.samples import ANGULAR, OBLIQUE, Samples, SpotSumImage, _Gathered
@@ -66,7 +66,9 @@ def test_obliqueness_of_both_ends_is_told() -> None:
     """Rationale: (.5 (1 - cosine)^4)^2 of the laser's incidence and of the cameras' views by their weight."""
     s = gathered_twice(0.0, 0.9, incidence=0.3)
     np.testing.assert_allclose(s.oblique, 0.25 * (0.7**8 + 0.1**8), rtol=1e-4)
-    measured = Measured.of(replace(s, dark_variance=0 * s.dark_variance, noise_per_signal=0 * s.noise_per_signal), 0)
+    measured = LaserSamples.of(
+        replace(s, dark_variance=0 * s.dark_variance, noise_per_signal=0 * s.noise_per_signal), 0
+    )
     np.testing.assert_allclose(measured.variance(np.ones_like(s.oblique)), s.oblique)
 
 
