@@ -1,7 +1,7 @@
 """The calibration of a captured rig, from its own images alone: lenses, white balance, poses, projector.
 
 Reads CAPTURE/calibration/<camera>/ (boards and the white plate) and, from the capture itself, silhouettes and spots.
-Every stage starts from the nominal rig and knows how far a set-up may be off it; none knows more.
+Every stage starts from the nominal rig and the tolerances of a set-up, and from nothing else of the actual rig.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ PLATE_SPOT_MM = 0.05  # how well a spot's place on the white plate is seen
 
 @dataclass(frozen=True)
 class RigMeasurement:
-    """The calibration, and what each stage says about itself."""
+    """The calibration, and the figures of each of its stages."""
 
     calibration: Calibration
     cameras: tuple[CameraImages, ...]
@@ -63,7 +63,7 @@ class RigMeasurement:
 
 
 def measure(capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh) -> RigMeasurement:
-    """All stages. `mesh`: the scan, object frame, mm."""
+    """All stages. `mesh`: the scan, object frame, mm. Raises: DiscoError where the images do not tell a part."""
     response = measure_response(capture, rig, sensor) if rig.sensor.response == "curved" else None
     if response is not None:
         sensor = replace(sensor, response=tuple(float(x) for x in response.exposure))

@@ -7,7 +7,6 @@ turntable angle, cameras outermost: view = camera * n_angles + angle.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -18,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from hw.base.config import Strict, as_table, check
-from hw.base.errors import InputError
+from hw.base.config import Strict, as_table, read_json
 from hw.base.files import write_atomically
 from hw.interface import Aim
 from hw.record import RadianceImage, RawImage, Sensor, to_radiance
@@ -173,16 +171,8 @@ class Calibration(Strict):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what `save` wrote; anything else is refused in one line."""
-        try:
-            data = json.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise InputError(f"cannot be read ({error.strerror})", file=path, remedy="calibrate first") from error
-        except ValueError as error:
-            raise InputError("is not JSON", file=path, remedy="calibrate again") from error
-        if not isinstance(data, dict) or data.get("format_version") != 1:
-            raise InputError("not a calibration of format version 1", file=path, remedy="calibrate again")
-        return check(data, cls, path)
+        """Read what `save` wrote. Raises: InputError where it is missing, damaged or of another format version."""
+        return read_json(path, cls, "calibrate again")
 
 
 @lru_cache(maxsize=32)

@@ -175,6 +175,8 @@ def fit_poses(
     """images: per view (cameras outermost), (H, W) radiance under the floodlight; cameras: object frame, first angle.
 
     lens_covariance: per camera, (4, 4) of focal, centre, k1; None: the lenses are exact
+
+    Raises: DiscoError where no edge lies near the scan's outline.
     """
     exact = [np.zeros((LENS, LENS))] * len(cameras)
     covariance = exact if lens_covariance is None else lens_covariance

@@ -72,7 +72,10 @@ def _normaliser(points: F64) -> F64:
 
 
 def projection(points: F64, steps: F64, tolerance: float, rng: np.random.Generator) -> Projection:
-    """Robust DLT: `tolerance` in steps separates true spots from false ones. Refused where it would mean nothing."""
+    """Robust DLT: `tolerance` in steps separates true spots from false ones.
+
+    Raises: DiscoError where too few spots agree, or nearly coplanar ones do.
+    """
     require_depth(points)
     best: Flags = np.zeros(len(points), bool)
     for _ in range(DRAWS):
@@ -94,7 +97,7 @@ def projection(points: F64, steps: F64, tolerance: float, rng: np.random.Generat
 
 
 def require_depth(points: F64) -> None:
-    """Refuse spots from which the projector's distance cannot be told."""
+    """Raises: DiscoError for spots from which the projector's distance does not follow: few, or nearly coplanar."""
     if len(points) < LEAST_SPOTS:
         raise DiscoError(
             f"{len(points)} spots were seen by a camera, {LEAST_SPOTS} are needed to find the projector. "

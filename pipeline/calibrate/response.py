@@ -44,6 +44,8 @@ class Response:
 def fit_response(images: Sequence[NDArray[np.uint16]], seconds: Sequence[float], sensor: Sensor) -> Response:
     """images: (K, H, W) digital numbers of a still scene, each exposed for its time. The full well's charge stands for
     the largest digital number, the offset for none; dark current counts as light of the scene.
+
+    Raises: InputError for a bracket that is not one, leaves a part of the response open, or fits no steady light.
     """
     if (
         len(images) < 2

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
+from hw.base.config import read_json
 from hw.base.errors import DiscoError, InputError
 from hw.record import RawImage, Sensor, to_radiance
 from pipeline.calibrate.intrinsics import Intrinsics, board_pose, find_corners, fit_intrinsics
@@ -69,11 +69,8 @@ def intact(raw: RawImage | CorruptImage) -> RawImage:
 
 
 def read_targets(folder: Path, rig: RigConfig, camera: int, sensor: Sensor) -> CameraImages:
-    """Lens and white balance of one camera."""
-    try:
-        targets = TypeAdapter(Targets).validate_json((folder / TARGETS).read_bytes())
-    except ValueError as error:
-        raise InputError("cannot be read", file=folder / TARGETS, remedy="take the calibration images again") from error
+    """Lens and white balance of one camera. Raises: InputError, DiscoError where the targets do not tell them."""
+    targets = read_json(folder / TARGETS, Targets, "take the calibration images again")
     nominal, board = PinholeCamera.from_config(rig.cameras[camera]), targets.corners()
     with StreamReader(folder) as stream:
         stream.require_complete()

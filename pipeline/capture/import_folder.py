@@ -70,7 +70,10 @@ Key = tuple[int, int, int, int, int]  # camera, angle, u, v, laser; a silhouette
 
 
 def import_capture(folder: Path, out: Path, progress: Callable[[int, int], None] | None = None) -> Plan:
-    """Write the stream and what the pipeline is told with it into `out`; the plan that the images make up."""
+    """Write the stream and what the pipeline is told with it into `out`; the plan that the images make up.
+
+    Raises: InputError, with the line of the table where there is one.
+    """
     described = load_toml(
         folder / "capture.toml", CaptureDescription, "a capture.toml (docs/lab.md, section 6, shows one)"
     )
@@ -252,7 +255,7 @@ def _pixels(
 
 
 def read_frame(path: Path, shape: tuple[int, int], full_scale_dn: int, where: str) -> NDArray[np.uint16]:
-    """(height, width) digital numbers of a 16-bit grey image; anything else is refused."""
+    """(height, width) digital numbers of a 16-bit grey image; Raises: InputError for anything else."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # Pillow reads a damaged file as far as it gets

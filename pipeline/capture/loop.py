@@ -1,4 +1,4 @@
-"""The capture loop: drives a rig through a plan, image by image, into a stream. Knows the interface, not the rig.
+"""The capture loop: drives a rig through a plan, image by image, into a stream, by the interface alone.
 
 Gates are shut during every move, and one at most is open. The clock is restored on resuming, and with it the state of
 turntable and projector, so that a capture that was interrupted ends with the very bytes of one that was not.

@@ -78,7 +78,7 @@ class _Reference:
 
 
 def require_unmoved(rig: Rig, stored: StreamReader, sensor: Sensor) -> list[SpotComparison]:
-    """Shoot a stored spot of every laser again; refuse to go on if one differs, or if none is bright enough to tell.
+    """Shoot a stored spot of every laser again. Raises: RigMoved where one differs, or all are too dim to compare.
 
     A laser whose spots are all dim among bright ones is compared by its power alone: that mirrors and object are where
     they were is told by the others. A laser without a stored spot has nothing to be compared with. Leaves turntable,

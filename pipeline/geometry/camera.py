@@ -25,6 +25,8 @@ def look_at(position: ArrayLike, aim: ArrayLike, up: ArrayLike = (0, 0, 1)) -> F
     """(4, 4) transform world -> device for a device at `position` with +z towards `aim`, x right, y down.
 
     A device that looks straight along `up` (within 1e-6 rad) takes +y as up instead, or +x where it looks along y.
+
+    Raises: InputError where both are one point.
     """
     eye = np.asarray(position, float)
     forward = np.asarray(aim, float) - eye

@@ -39,7 +39,10 @@ class Surface:
 
 
 def reconstruct_surface(points: F64, normals: F64, vertices: int) -> Surface:
-    """(N, 3) points in mm with (N, 3) outward normals -> a mesh of about `vertices` vertices."""
+    """(N, 3) points in mm with (N, 3) outward normals -> a mesh of about `vertices` vertices.
+
+    Raises: InputError for too few points, or points that no closed surface follows.
+    """
     if len(points) < 4 * PATCH_POINTS:
         raise InputError("too few points", key="points", value=len(points), allowed=f"at least {4 * PATCH_POINTS}")
     v, f = gpytoolbox.point_cloud_to_mesh(

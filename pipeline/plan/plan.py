@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from hw.base.config import Strict
+from hw.base.config import Strict, read_json
 from hw.base.errors import InputError
 from hw.interface import Aim
 from pipeline.geometry.nominal_rig import RigConfig
@@ -60,7 +60,11 @@ class _PlanFile(Strict):
 
 @dataclass(frozen=True)
 class Plan:
-    """cameras: names; angles_rad: turntable angles; spots: grouped by angle, in the order they are lit."""
+    """cameras: names; angles_rad: turntable angles; spots: grouped by angle, in the order they are lit.
+
+    The plan of a camera's targets counts placements instead of angles, and `angles_rad` holds their numbers 0, 1, 2 ...
+    (`pipeline.plan.targets`): nothing turns between them, and the file keeps one form.
+    """
 
     cameras: tuple[str, ...]
     angles_rad: tuple[float, ...]
@@ -148,29 +152,19 @@ class Plan:
 
 
 def load_plan(path: Path) -> Plan:
-    """Read plan.json; refuses other versions and anything malformed."""
+    """Read plan.json. Raises: InputError where it is missing, damaged, or of another format version."""
+    remedy = "repeat the capture command"
+    file = read_json(path, _PlanFile, remedy)
     try:
-        text = path.read_text(encoding="utf-8")
-        version = json.loads(text).get("format_version")
-    except (OSError, ValueError, AttributeError, RecursionError) as error:
-        raise InputError(f"not a readable plan ({error})", file=path, remedy="repeat the capture command") from error
-    if version != FORMAT_VERSION:
-        raise InputError(
-            "another version's plan", file=path, key="format_version", value=version,
-            allowed=str(FORMAT_VERSION), remedy="capture into another folder",
-        )  # fmt: skip
-    try:
-        file = _PlanFile.model_validate_json(text)
         return Plan(file.cameras, file.angles_rad, tuple(Aim(*spot) for spot in file.spots), file.lasers)
-    except (ValidationError, ValueError) as error:
-        reason = str(error.errors()[0]["msg"]) if isinstance(error, ValidationError) else str(error)
-        raise InputError(f"malformed plan: {reason}", file=path, remedy="repeat the capture command") from error
+    except ValueError as error:
+        raise InputError(f"is damaged ({error})", file=path, remedy=remedy) from error
 
 
 def make_plan(rig: RigConfig, mesh: trimesh.Trimesh) -> Plan:
     """The plan of a nominal rig for the scanned mesh (object frame, mm): exactly `rig.spots` spots.
 
-    Refuses a rig whose cameras do not see the object or whose laser does not reach it in enough places.
+    Raises: InputError where a camera does not see the object, or the laser does not reach it in enough places.
     """
     require_rig_in_sight(rig, mesh)
     angles = tuple(float(a) for a in np.deg2rad(rig.turntable_angles_deg))

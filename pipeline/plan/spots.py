@@ -48,7 +48,7 @@ class Candidates:
 
 
 def choose_spots(rig: RigConfig, mesh: trimesh.Trimesh) -> tuple[Aim, ...]:
-    """Exactly `rig.spots` aims, grouped by turntable angle."""
+    """Exactly `rig.spots` aims, by turntable angle. Raises: InputError where the laser reaches too few places."""
     projectors = [
         TwoMirrorProjector.from_config(rig.projector).seen_from(turn(angle))
         for angle in np.deg2rad(rig.turntable_angles_deg)

@@ -93,7 +93,7 @@ def make_targets(rig: RigConfig, camera: int) -> tuple[Targets, Plan]:
     )
     lit = [(i, p) for i, p in enumerate(placements) if p.kind == "white"]
     spots = tuple(aim for i, p in lit for aim in _plate_aims(rig, config, np.array(p.pose), i))
-    return targets, Plan((config.name,), tuple(float(i) for i in range(len(placements))), spots, len(rig.lasers))
+    return targets, _plan(targets, spots, rig)
 
 
 def make_bracket(rig: RigConfig, camera: int) -> tuple[Targets, Plan]:
@@ -101,8 +101,12 @@ def make_bracket(rig: RigConfig, camera: int) -> tuple[Targets, Plan]:
     config, (targets, _) = rig.cameras[camera], make_targets(rig, camera)
     board = Placement(kind="board", mount=2, pose=pose_rows(_board_pose(config, 3)))
     still = targets.model_copy(update={"placements": (board,) * rig.sensor.steps})
-    angles = tuple(float(k) for k in range(rig.sensor.steps))
-    return still, Plan((config.name,), angles, (), len(rig.lasers))
+    return still, _plan(still, (), rig)
+
+
+def _plan(targets: Targets, spots: tuple[Aim, ...], rig: RigConfig) -> Plan:
+    """One camera's images, placement by placement: `angles_rad` holds the placements' numbers, which are no angles."""
+    return Plan((targets.camera,), tuple(map(float, range(len(targets.placements)))), spots, len(rig.lasers))
 
 
 def width_mm(config: CameraConfig) -> float:

@@ -19,7 +19,10 @@ LEAST_SHARE = 0.25  # of the surface that a vertex of the scan stands for, in an
 
 
 def require_rig_in_sight(rig: RigConfig, mesh: trimesh.Trimesh) -> None:
-    """Cameras and projector stand outside the object at every turntable angle, and every camera sees enough of it."""
+    """Cameras and projector stand outside the object at every turntable angle, and every camera sees enough of it.
+
+    Raises: InputError.
+    """
     angles = np.deg2rad(rig.turntable_angles_deg)
     for angle in angles:
         _require_outside(rig.projector.position_mm, angle, mesh, "rig.projector", "the projector")
@@ -29,7 +32,7 @@ def require_rig_in_sight(rig: RigConfig, mesh: trimesh.Trimesh) -> None:
 
 
 def require_in_sight(config: CameraConfig, mesh: trimesh.Trimesh, key: str, what: str, angle_rad: float = 0.0) -> None:
-    """Refuse a camera that stands inside the object or shows too little of it. `key`: its table in the scene."""
+    """`key`: the camera's table in the scene. Raises: InputError where it is inside the object, or shows too little."""
     _require_outside(config.position_mm, angle_rad, mesh, key, what)
     pixels, surface = _visible(PinholeCamera.from_config(config).seen_from(turn(angle_rad)), mesh)
     at = f" at turntable angle {np.rad2deg(angle_rad):g} deg" if angle_rad else ""

@@ -1,4 +1,4 @@
-"""A stream's two files on disk: where an image lies, how far the stream reaches, what is told when the disk refuses."""
+"""A stream's two files on disk: where an image lies, how far the stream reaches, what the disk refuses."""
 
 from __future__ import annotations
 
@@ -42,7 +42,10 @@ class StreamFiles:
         os.close(self.journal)
 
     def digest(self) -> bytes | None:
-        """Digest of the plan that this stream belongs to; None if neither file has a header."""
+        """Digest of the plan that this stream belongs to; None if neither file has a header.
+
+        Raises: InputError for another format version.
+        """
         for file, magic in ((self.images, IMAGES_MAGIC), (self.journal, JOURNAL_MAGIC)):
             header = unpack_header(os.pread(file, HEADER_BYTES, 0), magic)
             if header is not None and header[0] != FORMAT_VERSION:

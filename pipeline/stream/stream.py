@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 
 class CorruptImage(DiscoError):
-    """One stored image is damaged; the others are not concerned. Knows `index` and `address`."""
+    """One stored image is damaged; the others are not concerned. `index`, `address`: which."""
 
     def __init__(self, index: int, address: ImageAddress, reason: str) -> None:
         self.index, self.address = index, address
@@ -44,7 +44,9 @@ class StreamWriter:
     """Appends images to the stream of a plan in a folder; opening an unfinished stream continues it.
 
     An image that was damaged at the very end (a crash of the machine) is dropped on opening, with a warning, and is
-    to be appended again: `len` says which image is next. One process at a time.
+    to be appended again: `len` is the number of the next image. One process at a time.
+
+    Raises: StorageError where the disk refuses; InputError for another plan's folder; DiscoError while it is in use.
     """
 
     def __init__(self, folder: Path, plan: Plan) -> None:
@@ -174,7 +176,7 @@ class StreamWriter:
 
 
 class StreamReader:
-    """Random access to a stream, finished or not. Safe to use from several threads."""
+    """Random access to a stream, finished or not, from several threads. Raises: InputError where there is none."""
 
     def __init__(self, folder: Path) -> None:
         self.plan, self.folder = load_plan(folder / PLAN), folder
@@ -199,7 +201,7 @@ class StreamReader:
         return len(self) == len(self.plan)
 
     def require_complete(self) -> None:
-        """Refuse a stream that was cut off."""
+        """Raises: InputError for a stream that was cut off."""
         if not self.complete:
             raise InputError(
                 f"the stream ends after {len(self)} of {len(self.plan)} images",

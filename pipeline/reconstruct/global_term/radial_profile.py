@@ -149,9 +149,9 @@ def fit_profile(
     offset: F64 | float = 0.0,
     start: Profile | None = None,
 ) -> tuple[Profile, DirectionBias]:
-    """Fit f and the tilt's slopes so that exp(offset + slope * tilt) * (mean of f over the patches) meets the values.
+    """Fit f and the bias's slopes so that exp(offset + slope * bias) * (mean of f over the patches) meets the values.
 
-    tilt: (S, V) of the samples; offset: (S, V) or 0; start: a first guess. f is the mean over all directions.
+    direction_bias: (S, V) of the samples; offset: (S, V) or 0; start: a first guess. f is the mean over all directions.
     """
     knots = _knots(edge, float(pairs.distance.max()) * 1.01)
     profile = start or Profile(knots, _start(Profile(knots, np.zeros(len(knots) - 4)), measured, pairs.distance))
@@ -180,7 +180,7 @@ def fit_profile(
 def over_directions(samples: Samples, laser: int) -> tuple[LaserSamples, Profile]:
     """One laser's samples with the direction's factor taken out, and the profile: what the simple models are fitted to.
 
-    They know nothing of directions; a mean over those that the cameras happened to look from would be too low.
+    They have no directions; a mean over those that the cameras happened to look from would be too low.
     """
     measured = LaserSamples.of(samples, laser)
     edge = float(samples.mesh.edges_unique_length.mean())

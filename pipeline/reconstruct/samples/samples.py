@@ -53,7 +53,7 @@ class Samples:
     values: (L, S, V) mm^-2, NaN where not observed; averaged over the hat function of the vertex and over the beam
     dark_variance, noise_per_signal: (L, S, V); an entry of expectation m has variance dark + per_signal * m
     oblique: (S, V) relative variance that obliqueness adds at both ends (`oblique_variance`)
-    tilt: (S, V) sum of `forward_component` at both ends, mean over the cameras
+    direction_bias: (S, V) sum of `forward_component` at both ends, mean over the cameras
     glow: per view, images summed over its spots
     """
 
