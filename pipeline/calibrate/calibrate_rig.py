@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from hw.base.arrays import F64, I64
 from hw.base.errors import DiscoError
 from hw.record import Sensor, to_radiance
 from pipeline.calibrate.calibration import (
@@ -40,8 +40,6 @@ from pipeline.geometry.projector import TwoMirrorProjector
 from pipeline.plan.plan import ImageAddress
 from pipeline.plan.targets import FOLDER
 from pipeline.stream.stream import CorruptImage, StreamReader
-
-F64 = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 
@@ -114,8 +112,8 @@ def plane_measurement(cameras: Sequence[CameraImages], poses: PoseFit, projector
 class Sightings:
     """Peaks of one laser in all images that could be read. view, spot: (N,); power: (N,) W."""
 
-    view: NDArray[np.int64]
-    spot: NDArray[np.int64]
+    view: I64
+    spot: I64
     power: F64
     peaks: tuple[Peak, ...]
 

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from hw.base.arrays import F64
 from hw.base.config import Strict, as_table, read_json
 from hw.base.files import write_atomically
 from hw.interface import Aim
@@ -25,7 +25,6 @@ from pipeline.geometry.camera import PinholeCamera, Pose, pose_rows, turn
 from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.geometry.projector import TwoMirrorProjector
 
-F64 = NDArray[np.float64]
 NotNegative = Annotated[float, Field(ge=0)]
 Error = NotNegative | None  # one standard deviation; None: not measured
 Errors3 = tuple[NotNegative, NotNegative, NotNegative] | None  # the same along x, y, z of the device's frame

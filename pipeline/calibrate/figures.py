@@ -9,15 +9,14 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from hw.base.arrays import F64
 
 if TYPE_CHECKING:
     from pipeline.calibrate.calibrate_rig import RigMeasurement
     from pipeline.calibrate.pose import PoseFit
     from pipeline.calibrate.projector_fit import ProjectorFit
     from pipeline.calibrate.target_images import CameraImages
-
-F64 = NDArray[np.float64]
 
 
 def figures(found: RigMeasurement) -> dict[str, Any]:

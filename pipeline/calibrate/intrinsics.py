@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from hw.base.arrays import F64
 from hw.base.errors import DiscoError
 from pipeline.calibrate.least_squares import Linearised, Prior, minimise
 from pipeline.geometry.camera import PinholeCamera
-
-F64 = NDArray[np.float64]
 
 # What a lens and its mount keep to, standard deviations: focal length (share), centre (share of the width), k1.
 FOCAL_TOLERANCE, CENTRE_TOLERANCE, K1_TOLERANCE = 0.005, 0.008, 0.08

@@ -13,10 +13,9 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-F64 = NDArray[np.float64]
+from hw.base.arrays import F64, I64
 
 END = 1e-10  # relative change of the sum or of the unknowns: far below any error bar
 
@@ -90,7 +89,7 @@ class Linearised:
         pull = self.prior.precision @ (self.value - self.prior.mean)
         return -np.asarray(np.linalg.solve(self.precision, self.jacobian.T @ (self.weight * self.residual) + pull))
 
-    def scatter(self, group: NDArray[np.int64], parameters: int | None = None, about_mean: bool = False) -> F64:
+    def scatter(self, group: I64, parameters: int | None = None, about_mean: bool = False) -> F64:
         """(P, P) covariance of the gradient, from how it differs between groups of measurements that err together.
 
         group: (K,) numbers; parameters: P, but for unknowns that belong to one group each. With it the covariance of

@@ -14,10 +14,9 @@ import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage, special
 
+from hw.base.arrays import F64, Bool
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.mesh import RayMesh
-
-F64 = NDArray[np.float64]
 
 PIXEL_BLUR = 12**-0.5  # standard deviation of a pixel's own box, in pixels
 INSIDE, OUTSIDE, SPACING = 4.0, 3.0, 0.5  # pixels along the normal that an edge is fitted to
@@ -93,7 +92,7 @@ def _edge_models() -> tuple[F64, F64, F64]:
     return offset, edge, np.linalg.qr(bases)[0]
 
 
-def edges_along(image: NDArray[np.floating], pixel: F64, normal: F64) -> tuple[F64, NDArray[np.bool_]]:
+def edges_along(image: NDArray[np.floating], pixel: F64, normal: F64) -> tuple[F64, Bool]:
     """(K,) pixels outward of (K, 2) `pixel` at which the image's edge crosses each of (K, 2) normals, (K,) if found."""
     offset, edge, bases = _edge_models()
     at = pixel[:, None] + offset[:, None] * normal[:, None]
@@ -113,20 +112,20 @@ def edges_along(image: NDArray[np.floating], pixel: F64, normal: F64) -> tuple[F
     return np.clip(found, -REACH, REACH), good
 
 
-def object_mask(image: NDArray[np.floating]) -> NDArray[np.bool_]:
+def object_mask(image: NDArray[np.floating]) -> Bool:
     """(H, W) the thesis's silhouette: a threshold, between the background and the darkest parts of the object."""
     image = np.asarray(image, np.float64)
     dark, light = np.percentile(image, 5), np.percentile(image, 99)
     return np.asarray(ndimage.binary_opening(image > dark + 0.15 * (light - dark)))
 
 
-def signed_distance(mask: NDArray[np.bool_]) -> F64:
+def signed_distance(mask: Bool) -> F64:
     """(H, W) pixels from the mask's border, positive outside."""
     outside, inside = ndimage.distance_transform_edt(~mask), ndimage.distance_transform_edt(mask)
     return np.asarray(np.where(mask, 0.5 - inside, outside - 0.5))
 
 
-def mesh_mask(mesh: trimesh.Trimesh, camera: PinholeCamera) -> NDArray[np.bool_]:
+def mesh_mask(mesh: trimesh.Trimesh, camera: PinholeCamera) -> Bool:
     """(H, W) pixels whose centre shows the mesh."""
     hit = mesh.ray.intersects_any(*camera.rays(camera.pixel_centres()))
     return np.asarray(hit.reshape(camera.height, camera.width))

@@ -10,9 +10,8 @@ import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from hw.base.arrays import F64, Bool
 from pipeline.geometry.mesh import RayMesh
-
-F64 = NDArray[np.float64]
 
 ABOVE = 0.35  # of the peak: what lies above it around the peak is the spot
 LARGEST = 5.0  # times the beam's cross-section: an oblique beam on a translucent surface, but not a glow
@@ -52,7 +51,7 @@ def brightness(peaks: Sequence[Peak], power: F64) -> float:
     return float(np.percentile(np.array([p.value for p in peaks]) / power, 90)) if len(peaks) else 0.0
 
 
-def seen(peaks: Sequence[Peak], power: F64, beam_px: float, bright: float) -> NDArray[np.bool_]:
+def seen(peaks: Sequence[Peak], power: F64, beam_px: float, bright: float) -> Bool:
     """(N,) whether images show the spots themselves, rather than what glows around a hidden one.
 
     power: (N,) W; beam_px: the beam's diameter in pixels; bright: `brightness`. A hidden spot's brightest place is
@@ -65,9 +64,7 @@ def seen(peaks: Sequence[Peak], power: F64, beam_px: float, bright: float) -> ND
     return np.asarray(small & inside & (value > FAINTEST * bright))
 
 
-def footprint(
-    mesh: trimesh.Trimesh, origins: F64, ways: F64, eyes: F64, radius: float
-) -> tuple[F64, F64, NDArray[np.bool_]]:
+def footprint(mesh: trimesh.Trimesh, origins: F64, ways: F64, eyes: F64, radius: float) -> tuple[F64, F64, Bool]:
     """Where beams of a width meet a curved surface, as a camera weighs it: (N, 3) axis, (N, 3) centroid, (N,) all hit.
 
     origins, ways: (N, 3) beams' axes, mm; eyes: (N, 3) unit, towards the camera. On a surface seen or lit obliquely the

@@ -11,11 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hw.base.arrays import F64, I64
 from pipeline.geometry.camera import PinholeCamera
-
-F64 = NDArray[np.float64]
 
 PLACE_SHARE = 2e-4  # a board's corners tell its plane's area to about this
 PLACE_FREEDOM = 1.5  # few: places that do differ by far more than that are believed
@@ -65,7 +63,7 @@ def pixel_areas(camera: PinholeCamera, plane: F64) -> F64:
     return np.asarray((depth**2 / camera.focal.prod() / slope).reshape(camera.height, camera.width))
 
 
-def balance(light: F64, reading: F64, share: F64, place: NDArray[np.int64]) -> WhiteBalance:
+def balance(light: F64, reading: F64, share: F64, place: I64) -> WhiteBalance:
     """light: (L, N) sums of radiance times area in W/sr; reading: (L, N) photodiode, W; share: (L,) of the plate.
 
     place: (N,) which exposures were made in one place of the plate; a plate's pose errs for all of them alike

@@ -17,13 +17,12 @@ from scipy import ndimage
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from hw.base.arrays import F64, I64, Bool
 from hw.base.errors import DiscoError
 from pipeline.calibrate.least_squares import Huber, Linearised, Prior
 from pipeline.calibrate.outline import Outline, edges_along, mesh_mask, object_mask, outline, signed_distance, synthetic
 from pipeline.calibrate.scan_error import surface_error
 from pipeline.geometry.camera import PinholeCamera, turn
-
-F64 = NDArray[np.float64]
 
 # What the set-up keeps to, standard deviations. Silhouettes overrule all of it where they can tell.
 PLACE_MM, PLACE_RAD = 20.0, np.deg2rad(10.0)  # of a camera against the object
@@ -148,7 +147,7 @@ class _Sweep:
         return np.stack(columns, axis=1)
 
 
-def _lens_rows(sweep: _Sweep) -> NDArray[np.bool_]:
+def _lens_rows(sweep: _Sweep) -> Bool:
     """(P,) which increments are of lenses. The boards know these better than any silhouette: they stay as they are."""
     rows = np.zeros(sweep.size, bool)
     for c in range(len(sweep.lenses)):
@@ -186,7 +185,7 @@ def fit_poses(
     return _fine(_coarse(start, masks, mesh), images, masks, mesh, covariance)
 
 
-def _coarse(start: _Sweep, masks: Sequence[NDArray[np.bool_]], mesh: trimesh.Trimesh) -> _Sweep:
+def _coarse(start: _Sweep, masks: Sequence[Bool], mesh: trimesh.Trimesh) -> _Sweep:
     """Down the distance to the silhouettes, from several starts that differ by a few degrees; the best by XOR."""
     distances = [signed_distance(m) for m in masks]
     prior = _prior(start, 0.1)
@@ -225,9 +224,7 @@ _STARTS = np.array([(0, 0, 0), (_TEN, 0, 0), (-_TEN, 0, 0), (0, _TEN, 0), (0, -_
 GOOD_ENOUGH = 0.012  # XOR as a share of the silhouettes: no other start is tried
 
 
-def _centred(
-    sweep: _Sweep, camera: int, mask: NDArray[np.bool_], mesh: trimesh.Trimesh, nominal: PinholeCamera
-) -> _Sweep:
+def _centred(sweep: _Sweep, camera: int, mask: Bool, mesh: trimesh.Trimesh, nominal: PinholeCamera) -> _Sweep:
     """Shift the object before a camera until centroid and area of its silhouette are the photograph's."""
     for _ in range(3):
         seen = sweep.lenses[camera]
@@ -248,7 +245,7 @@ def _centred(
 def _fine(
     sweep: _Sweep,
     images: Sequence[NDArray[np.floating]],
-    masks: Sequence[NDArray[np.bool_]],
+    masks: Sequence[Bool],
     mesh: trimesh.Trimesh,
     lens: Sequence[F64],
 ) -> PoseFit:
@@ -289,7 +286,7 @@ def _fine(
 
 def _edges_of(
     sweep: _Sweep, view: int, image: NDArray[np.floating], mesh: trimesh.Trimesh, exact: bool
-) -> tuple[F64, F64, F64, NDArray[np.int64], F64]:
+) -> tuple[F64, F64, F64, I64, F64]:
     """One view's rows: (K, P) derivative of the edge's place, (K,) pixels it is off, (K,) weight, (K,) sector, (K, 4)
     the place itself, object frame, and pixels per mm of the surface's motion along its normal.
 
@@ -303,9 +300,7 @@ def _edges_of(
         away, good = away - bias, good & also
     j = sweep.jacobian(view, rim)
     around = np.arctan2(*(rim.pixel - rim.pixel.mean(axis=0)).T[::-1]) if len(rim.pixel) else np.zeros(0)
-    sector: NDArray[np.int64] = view * SECTORS + np.minimum((around / (2 * np.pi) + 0.5) * SECTORS, SECTORS - 1).astype(
-        np.int64
-    )
+    sector: I64 = view * SECTORS + np.minimum((around / (2 * np.pi) + 0.5) * SECTORS, SECTORS - 1).astype(np.int64)
     depth = rim.points @ camera.pose[2, :3] + camera.pose[2, 3]
     scale = camera.focal.mean() / (depth * np.linalg.norm(rim.across[:, :2], axis=1))
     place = np.column_stack([rim.points, scale])
@@ -318,7 +313,7 @@ def _result(
     image: F64,
     residual: float,
     edges: int,
-    masks: Sequence[NDArray[np.bool_]],
+    masks: Sequence[Bool],
     mesh: trimesh.Trimesh,
 ) -> PoseFit:
     views = [sweep.view(v) for v in range(len(masks))]

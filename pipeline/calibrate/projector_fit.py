@@ -12,15 +12,12 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from hw.base.arrays import F64, I64, Bool
 from hw.base.errors import DiscoError
 from pipeline.calibrate.least_squares import Huber, Prior, minimise
 from pipeline.geometry.projector import TwoMirrorProjector
-
-F64 = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 DRAWS, SAMPLE = 400, 8
 LEAST_SPOTS = 12
@@ -40,7 +37,7 @@ class Projection:
 
     matrix: F64
     centre: F64
-    inliers: Flags
+    inliers: Bool
 
     def steps(self, points: F64) -> F64:
         """(N, 3) mm -> (N, 2) steps."""
@@ -77,7 +74,7 @@ def projection(points: F64, steps: F64, tolerance: float, rng: np.random.Generat
     Raises: DiscoError where too few spots agree, or nearly coplanar ones do.
     """
     require_depth(points)
-    best: Flags = np.zeros(len(points), bool)
+    best: Bool = np.zeros(len(points), bool)
     for _ in range(DRAWS):
         some = rng.choice(len(points), SAMPLE, replace=False)
         good = _misses(dlt(points[some], steps[some]), points, steps) < tolerance
@@ -184,7 +181,7 @@ class ProjectorFit:
     projector: TwoMirrorProjector
     covariance: F64
     rms_mm: float
-    false: Flags
+    false: Bool
     shift: F64
     shift_error: F64
     images: int = 0
@@ -203,7 +200,7 @@ def refine(
     normals: F64,
     to_eye: F64,
     size: StepSize | None = None,
-    group: NDArray[np.int64] | None = None,
+    group: I64 | None = None,
     place: F64 | None = None,
 ) -> ProjectorFit:
     """Two-mirror model by robust least squares on what the beam's axis misses the spots by, across the beam, in mm.

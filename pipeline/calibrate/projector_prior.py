@@ -10,17 +10,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from hw.base.arrays import F64
 from pipeline.calibrate.pose import PoseFit
 from pipeline.calibrate.projector_fit import ProjectorFit, own_place
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.geometry.projector import TwoMirrorProjector
-
-F64 = NDArray[np.float64]
 
 
 def nominal_projector(

@@ -12,13 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from hw.base.arrays import F64, I64, U16
 from hw.base.errors import InputError
 from hw.record import Sensor
-
-F64 = NDArray[np.float64]
 
 KNOTS = (np.arange(21) / 20) ** 2  # of the spline, as shares of the full well: dense in the dark, where it bends
 TABLE = 257  # entries of the inverse
@@ -41,7 +39,7 @@ class Response:
     chi2: float
 
 
-def fit_response(images: Sequence[NDArray[np.uint16]], seconds: Sequence[float], sensor: Sensor) -> Response:
+def fit_response(images: Sequence[U16], seconds: Sequence[float], sensor: Sensor) -> Response:
     """images: (K, H, W) digital numbers of a still scene, each exposed for its time. The full well's charge stands for
     the largest digital number, the offset for none; dark current counts as light of the scene.
 
@@ -168,7 +166,7 @@ def _require_steady(chi2: float, freedom: int) -> None:
         )
 
 
-def _spread(seen: F64) -> NDArray[np.int64]:
+def _spread(seen: F64) -> I64:
     """Pixels of all brightnesses: as many of each, by how bright they are over all exposures."""
     brightness = np.clip(seen, 0.0, 1.0).sum(axis=1)
     bins = np.digitize(brightness, np.linspace(brightness.min(), brightness.max() + 1e-9, 41)) - 1

@@ -12,11 +12,9 @@ import logging
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hw.base.arrays import F64, I64
 from pipeline.calibrate.least_squares import Linearised
-
-F64 = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 
@@ -92,7 +90,7 @@ class _Patches:
     @classmethod
     def of(
         cls, rest: F64, kinds: tuple[F64, F64], forms: tuple[F64, F64], alike: F64, alike_mm: float,
-        some: NDArray[np.int64],
+        some: I64,
     ) -> _Patches:  # fmt: skip
         """rest: (K,) pixels; kinds: (K, K) what is left of both errors; forms: (K, K); some: (S,) places that share no
         edge's own error, for the likelihood.
@@ -119,7 +117,7 @@ def _likelihood(rest: F64, covariance: F64) -> float:
     return -0.5 * float(np.linalg.slogdet(whole)[1] + len(rest) * np.log(max(scale, 1e-300)))
 
 
-def _thinned(apart: F64) -> NDArray[np.int64]:
+def _thinned(apart: F64) -> I64:
     """(S,) of the places, none nearer than NEAR_MM to another; apart: (K, K) mm."""
     free, kept = np.ones(len(apart), bool), []
     for k in range(len(apart)):

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hw.base.arrays import F64, U16
 from hw.base.config import read_json
 from hw.base.errors import DiscoError, InputError
 from hw.record import RawImage, Sensor, to_radiance
@@ -21,8 +21,6 @@ from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.plan.plan import ImageAddress
 from pipeline.plan.targets import BRACKET, FOLDER, TARGETS, Targets
 from pipeline.stream.stream import CorruptImage, StreamReader
-
-F64 = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +43,7 @@ def has_targets(capture: Path, rig: RigConfig) -> bool:
 
 def measure_response(capture: Path, rig: RigConfig, sensor: Sensor) -> Response:
     """From every camera's bracket of a board; the cameras are of one make and share one response."""
-    images: list[list[NDArray[np.uint16]]] = []
+    images: list[list[U16]] = []
     for camera in rig.cameras:
         with StreamReader(capture / FOLDER / camera.name / BRACKET) as stream:
             stream.require_complete()

@@ -21,10 +21,10 @@ from typing import Annotated, Literal
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from pydantic import Field
 
+from hw.base.arrays import U16
 from hw.base.config import NearbyFile, Strict, as_table, load_toml
 from hw.base.errors import InputError
 from hw.base.files import write_atomically
@@ -247,14 +247,12 @@ def _meta(plan: Plan, address: ImageAddress, frames: list[Frame]) -> ImageMeta:
 # ---- the frames
 
 
-def _pixels(
-    table: Path, frames: list[Frame], shape: tuple[int, int], bracket: Bracket
-) -> Iterator[tuple[int, NDArray[np.uint16]]]:
+def _pixels(table: Path, frames: list[Frame], shape: tuple[int, int], bracket: Bracket) -> Iterator[tuple[int, U16]]:
     for frame in frames:
         yield frame.exponent, read_frame(frame.file, shape, bracket.full_scale_dn, f"line {frame.line} of {table}")
 
 
-def read_frame(path: Path, shape: tuple[int, int], full_scale_dn: int, where: str) -> NDArray[np.uint16]:
+def read_frame(path: Path, shape: tuple[int, int], full_scale_dn: int, where: str) -> U16:
     """(height, width) digital numbers of a 16-bit grey image; Raises: InputError for anything else."""
     try:
         with warnings.catch_warnings():

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from hw.base.arrays import F64
 from hw.base.errors import DiscoError
 from hw.interface import Rig, gate_open
 from hw.record import RawImage, Sensor, to_radiance
@@ -23,7 +23,6 @@ from pipeline.stream.stream import CorruptImage, StreamReader
 
 log = logging.getLogger(__name__)
 
-F64 = NDArray[np.float64]
 
 LOOK_BACK = 30  # stored images, among which the brightest of a laser is its reference
 LOOK_FURTHER = 300  # images of a laser, spread over all before these, of which the last one that is bright serves

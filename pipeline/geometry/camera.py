@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from hw.base.arrays import F64
 from hw.base.errors import InputError
 from pipeline.geometry.distortion import distort
 from pipeline.geometry.nominal_rig import CameraConfig
 
-F64 = NDArray[np.float64]
 Row = tuple[float, float, float, float]
 Pose = tuple[Row, Row, Row, Row]  # a (4, 4) transform in a file
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from hw.base.arrays import F64, Bool
 
 DIRECTIONS, STEPS = 64, 400
 WIDEST = 4.0  # tangent of the largest angle off the axis that is looked at, 76 degrees
@@ -43,7 +42,7 @@ def covers_image(distortion: tuple[float, ...], half_width: float, half_height: 
         along_x, along_y = slope * x * x + 2 * p1 * y + 6 * p2 * x, slope * y * y + 6 * p1 * y + 2 * p2 * x
         determinant = (radial + along_x) * (radial + along_y) - across**2
         u, v = np.moveaxis(distort(np.stack([x, y], axis=-1), distortion), -1, 0)
-        outside: NDArray[np.bool_] = (np.abs(u) > half_width) | (np.abs(v) > half_height)
-    way_out: NDArray[np.bool_] = np.cumsum(outside, axis=1) - outside == 0  # with the first point outside
+        outside: Bool = (np.abs(u) > half_width) | (np.abs(v) > half_height)
+    way_out: Bool = np.cumsum(outside, axis=1) - outside == 0  # with the first point outside
     one_to_one = (determinant > 0) & np.isfinite(determinant)
     return not any(distortion) or bool(outside.any(axis=1).all() and one_to_one[way_out].all())

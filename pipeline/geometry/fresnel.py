@@ -9,7 +9,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from hw.base.arrays import F64
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class Boundary:
     ratio: tuple[float, ...] = (1.0,)
 
 
-def transmittance(cosine: ArrayLike, eta: float | Boundary) -> NDArray[np.float64]:
+def transmittance(cosine: ArrayLike, eta: float | Boundary) -> F64:
     """F_t: flux transmitted, for the cosine between the outward normal and the direction outside.
 
     Same shape as `cosine`; 0 at and below the horizon (cosine <= 0), 1 everywhere above it for eta = 1. `eta` is the

@@ -11,12 +11,9 @@ from functools import cached_property, lru_cache
 import gpytoolbox
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy import sparse
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
+from hw.base.arrays import F64, I64, Bool
 
 CREASE = np.cos(np.deg2rad(30.0))  # between a vertex's normal and a triangle's
 _OFFSET = 1e-5  # of the mesh's size: shadow rays start this far above the face, far beyond embree's float32

@@ -7,13 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from hw.base.arrays import F64, I64
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.mesh import RayMesh
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 BAND = 16  # rows of pixels whose rays are cast together: what is worked out for them stays in the cache
 AROUND = 2  # pixels around the mesh's outline that still belong to a view's window

@@ -11,12 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hw.base.arrays import F64
 from pipeline.geometry.camera import look_at
 from pipeline.geometry.nominal_rig import ProjectorConfig
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

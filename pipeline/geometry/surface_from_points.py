@@ -11,12 +11,10 @@ from dataclasses import dataclass
 import gpytoolbox
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from hw.base.arrays import F64
 from hw.base.errors import InputError
-
-F64 = NDArray[np.float64]
 
 PSR_DEPTH = 7  # cells of 1/128 of the object's extent
 SCREENING = 0.5  # weight of single points against smoothness: their noise is averaged

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from hw.base.arrays import F64, I64, Bool
 from hw.base.errors import InputError
 from hw.interface import Aim
 from pipeline.geometry.camera import turn
@@ -24,7 +24,6 @@ from pipeline.geometry.projector import TwoMirrorProjector
 if TYPE_CHECKING:
     import trimesh
 
-F64 = NDArray[np.float64]
 
 PROBE = 96  # rays per axis of the probing grid: finds parts of the object down to 1 % of its extent
 OVERSAMPLING = 8  # candidates per spot; 4 gives visibly uneven distances, 16 hardly changes them
@@ -35,15 +34,15 @@ class Candidates:
     """N aims that hit the object. angle: (N,), steps: (N, 2) int; position: (N, 3) mm in the object frame;
     cosine: (N,) of the incidence."""
 
-    angle: NDArray[np.int64]
-    steps: NDArray[np.int64]
+    angle: I64
+    steps: I64
     position: F64
     cosine: F64
 
     def __len__(self) -> int:
         return len(self.angle)
 
-    def __getitem__(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> Candidates:
+    def __getitem__(self, which: Bool | I64) -> Candidates:
         return Candidates(self.angle[which], self.steps[which], self.position[which], self.cosine[which])
 
 
@@ -101,7 +100,7 @@ def _candidates(projectors: list[TwoMirrorProjector], mesh: trimesh.Trimesh, den
     )
 
 
-def farthest_points(points: F64, cosine: F64, count: int) -> NDArray[np.int64]:
+def farthest_points(points: F64, cosine: F64, count: int) -> I64:
     """Indices of `count` of the (N, 3) points, each the one farthest from those before it, coarse to fine.
 
     Squared distances count in proportion to the cosine, (N,): of two aims at one place the more frontal one wins.

@@ -11,18 +11,16 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
+from hw.base.arrays import F64
 from hw.base.config import Strict
 from hw.interface import Aim
 from pipeline.geometry.camera import PinholeCamera, Pose, look_at, pose_rows
 from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
 from pipeline.geometry.projector import TwoMirrorProjector
 from pipeline.plan.plan import Plan
-
-F64 = NDArray[np.float64]
 
 TARGETS = "targets.json"
 FOLDER = "calibration"  # in the capture's folder

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import linalg as sparse_linalg
 
+from hw.base.arrays import F64, I64
 from pipeline.geometry.fresnel import Boundary, transmittance
-from pipeline.geometry.mesh import F64, I64, RayMesh
+from pipeline.geometry.mesh import RayMesh
 from pipeline.relight.incident_light import colour, finest_mm, from_many_directions, from_one_direction
 from pipeline.relight.lights import Environment, Light, Uniform
 

@@ -25,10 +25,9 @@ import zstandard
 from numpy.typing import NDArray
 from pcodec import ChunkConfig, ModeSpec, standalone
 
+from hw.base.arrays import I64, U8, U16
 from hw.record import RawImage
 
-U8 = NDArray[np.uint8]
-U16 = NDArray[np.uint16]
 Pixel = TypeVar("Pixel", np.uint8, np.uint16)
 
 RUN = 32  # pixels
@@ -107,7 +106,7 @@ def _kinds(runs: U16) -> tuple[U8, int]:
     return kinds, base
 
 
-def _order(kinds: U8) -> NDArray[np.int64]:
+def _order(kinds: U8) -> I64:
     """Indices that bring runs of one kind together and keep the image's order within."""
     return np.argsort(kinds, kind="stable")
 

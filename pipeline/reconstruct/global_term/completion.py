@@ -16,10 +16,10 @@ import logging
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg
 
+from hw.base.arrays import F32, F64, Bool
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.boundary_fit import measure_boundary
@@ -27,9 +27,6 @@ from pipeline.reconstruct.global_term.harmonics import Harmonics, harmonics
 from pipeline.reconstruct.global_term.radial_profile import DirectionBias, LaserSamples, fit_profile
 from pipeline.reconstruct.samples.samples import ANGULAR, Samples, SpotSumImage
 from pipeline.reconstruct.samples.spots import forward_component
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
 
 log = logging.getLogger(__name__)
 
@@ -135,7 +132,7 @@ def fit_laser(samples: Samples, laser: int, field: SymmetricField, start: F32) -
 
 def hold_measured(
     samples: Samples, fits: list[Fit], lognormal_mean_factor: F64, prior_variance: F64
-) -> tuple[F64, F64, NDArray[np.bool_]]:
+) -> tuple[F64, F64, Bool]:
     """(L, V, V) R_d in mm^-2 that holds what was measured, its relative variance, and (V, V) the measured entries.
 
     lognormal_mean_factor: (V, V) expectation over the fit; prior_variance: (V, V) relative variance of the fill, where
@@ -194,7 +191,7 @@ def unexplained(samples: Samples, basis: Harmonics, range_mm: float) -> F64:
     return np.asarray(np.clip(np.minimum(open_share, open_share.T), 0.0, 1.0))
 
 
-def measured_entries(samples: Samples) -> NDArray[np.bool_]:
+def measured_entries(samples: Samples) -> Bool:
     """(V, V) entries next to a sample: a spot lies in a triangle at one vertex and the other vertex was observed."""
     out = np.zeros((len(samples.mesh.vertices),) * 2, bool)
     for spot in np.flatnonzero(samples.spots.transmitted > 0):

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.linalg import eigh
 
+from hw.base.arrays import F64
 from pipeline.geometry.mesh import RayMesh
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import block_diag
 
+from hw.base.arrays import F64, Bool
 from pipeline.calibrate.least_squares import Linearised, Prior
 from pipeline.reconstruct.samples.distances import Pairs
 from pipeline.reconstruct.samples.samples import ANGULAR, Samples
-
-F64 = NDArray[np.float64]
 
 FAR_SCATTER = 0.3  # how the relative scatter of R_d about a smooth model grows with log(1 + edges / SCATTER_EDGES)
 SCATTER_EDGES = 3.0
@@ -39,7 +37,7 @@ class LaserSamples:
     """
 
     value: F64
-    observed: NDArray[np.bool_]
+    observed: Bool
     dark: F64
     noise: F64
     oblique: F64

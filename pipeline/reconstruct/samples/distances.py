@@ -13,16 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from hw.base.arrays import F64, I64
 from pipeline.geometry.mesh import RayMesh
 from pipeline.reconstruct.samples.spots import Spots
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 Kernel = Callable[[F64], F64]
 
 REACH = 4.0  # edges

@@ -12,15 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy import ndimage, sparse
 
+from hw.base.arrays import F64, I64, Bool
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import transmittance
 from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.pixel_footprints import SurfaceHits, trace_pixels
-
-F64 = NDArray[np.float64]
 
 SUPERSAMPLE = 4  # rays per pixel and axis
 JUMP = 8.0  # depth range inside a pixel, in pixel widths on the surface, that betrays a discontinuity
@@ -48,8 +46,8 @@ class Pixels:
     cosine: (N,) with the interpolated normal
     """
 
-    pixel: NDArray[np.int64]
-    vertices: NDArray[np.int64]
+    pixel: I64
+    vertices: I64
     barycentric: F64
     area: F64
     cosine: F64
@@ -107,7 +105,7 @@ class ImagePoints:
 
     pixel: F64
     cosine: F64
-    visible: NDArray[np.bool_]
+    visible: Bool
 
 
 def image_points(mesh: trimesh.Trimesh, camera: PinholeCamera, points: F64, normals: F64, lift: F64) -> ImagePoints:

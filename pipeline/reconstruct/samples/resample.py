@@ -18,6 +18,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy import sparse
 
+from hw.base.arrays import F32, F64, I64
 from hw.base.errors import DiscoError
 from hw.base.resources import usable_cores
 from hw.record import RawImage, Sensor, to_radiance
@@ -26,9 +27,6 @@ from pipeline.geometry.pixel_footprints import window
 from pipeline.plan.plan import ImageAddress
 from pipeline.reconstruct.samples.image_operators import ImageOperator
 from pipeline.stream.stream import CorruptImage, StreamReader
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +48,7 @@ class ViewReader:
 
     view: int
     window: tuple[slice, slice]
-    rows: Mapping[str, NDArray[np.int64]]
+    rows: Mapping[str, I64]
     operators: Mapping[str, sparse.csr_array]
     gain: F64
 
@@ -184,7 +182,7 @@ def resample(
     calibration: Calibration,
     readers: Sequence[ViewReader],
     transmitted: F64,
-    hidden: Mapping[tuple[int, int], NDArray[np.int64]],
+    hidden: Mapping[tuple[int, int], I64],
 ) -> Iterator[BatchResult]:
     """Read every spot image once, on all cores; the results come in one order always.
 
@@ -219,7 +217,7 @@ def resample(
 
 
 def _read(
-    result: BatchResult, i: int, raw: RawImage, sensor: Sensor, table: tuple[F32, F32], hidden: NDArray[np.int64] | None
+    result: BatchResult, i: int, raw: RawImage, sensor: Sensor, table: tuple[F32, F32], hidden: I64 | None
 ) -> None:
     """Read image number i of a batch; every step before the next image, while it is in the cache."""
     reader, scale = result.batch.reader, result.scale[i]
@@ -246,9 +244,7 @@ def _read(
             _read_in_part(result, i, sampling, own, full, hidden)
 
 
-def _read_in_part(
-    result: BatchResult, i: int, sampling: str, own: Sums, full: F32 | None, hidden: NDArray[np.int64] | None
-) -> None:
+def _read_in_part(result: BatchResult, i: int, sampling: str, own: Sums, full: F32 | None, hidden: I64 | None) -> None:
     """Blank the vertices that an image does not show. The noise of the others is kept apart, vertex by vertex: the sums
     over images cannot leave vertices out.
     """

@@ -15,6 +15,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy import sparse
 
+from hw.base.arrays import F32, F64, I64, Bool
 from pipeline.calibrate.calibration import Calibration
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.plan.plan import Plan
@@ -24,10 +25,6 @@ from pipeline.reconstruct.samples.resample import BatchResult, Sums, ViewReader,
 from pipeline.reconstruct.samples.spots import Spots, forward_component, locate_spots
 from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.stream.stream import StreamReader
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
-I64 = NDArray[np.int64]
 
 # Relative scatter of samples of one entry that differ in direction: all of them, and what oblique ones add. Measured as
 # the spread about a completed quick scene within two edges of the spots (docs/decisions/0013).
@@ -43,7 +40,7 @@ class SpotSumImage:
 
     camera: PinholeCamera
     image: F64
-    included: NDArray[np.bool_]
+    included: Bool
 
 
 @dataclass(frozen=True)
@@ -297,7 +294,7 @@ def highlights(
     return out
 
 
-def select_lasers(samples: Samples, lasers: NDArray[np.int64]) -> Samples:
+def select_lasers(samples: Samples, lasers: I64) -> Samples:
     """The samples of some of the lasers."""
     return replace(
         samples,

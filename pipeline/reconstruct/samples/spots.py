@@ -6,16 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from hw.base.arrays import F64, I64
 from pipeline.calibrate.calibration import Calibration
 from pipeline.geometry.fresnel import transmittance
 from pipeline.geometry.mesh import RayMesh
 from pipeline.plan.plan import Plan
 from pipeline.reconstruct.settings import ReconstructConfig
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
