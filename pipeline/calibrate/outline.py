@@ -72,7 +72,7 @@ def outline(mesh: trimesh.Trimesh, camera: PinholeCamera) -> Outline:
     flat = _unit(np.column_stack([flat, -(flat * rays).sum(axis=1)]))
     across = np.where(sharp[index, None], flat, across)
     normal = _unit(across[:, :2])
-    outer = ~mesh.ray.intersects_any(*camera.rays(at + CLEAR * normal))
+    outer = ~RayMesh.of(mesh).meets(*camera.rays(at + CLEAR * normal))
     return Outline(points[outer], at[outer], normal[outer], across[outer], length[outer])
 
 
@@ -127,8 +127,7 @@ def signed_distance(mask: Bool) -> F64:
 
 def mesh_mask(mesh: trimesh.Trimesh, camera: PinholeCamera) -> Bool:
     """(H, W) pixels whose centre shows the mesh."""
-    hit = mesh.ray.intersects_any(*camera.rays(camera.pixel_centres()))
-    return np.asarray(hit.reshape(camera.height, camera.width))
+    return RayMesh.of(mesh).meets(*camera.rays(camera.pixel_centres())).reshape(camera.height, camera.width)
 
 
 def synthetic(mesh: trimesh.Trimesh, camera: PinholeCamera, image: NDArray[np.floating]) -> F64:

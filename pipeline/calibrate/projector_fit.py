@@ -127,11 +127,6 @@ class StepSize:
     covariance: F64
     by_pose: F64 = field(default_factory=lambda: np.zeros((2, 6)))
 
-    @property
-    def error_rad(self) -> F64:
-        """(2,) standard deviations."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
-
 
 def step_size(points: F64, steps: F64, motion: F64, projector: TwoMirrorProjector, noise: float) -> StepSize:
     """The plane measurement (thesis figure 5.2). points: (N, 3) mm on the plane, projector's frame.

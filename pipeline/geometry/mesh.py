@@ -79,13 +79,17 @@ class RayMesh:
         barycentric[hit] = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
         return Hits(triangle, barycentric, distance)
 
+    def meets(self, origins: F64, directions: F64) -> Bool:
+        """(N,) whether each ray meets the mesh at all."""
+        return np.asarray(self.mesh.ray.intersects_any(origins, directions))
+
     def blocked(self, face: I64, points: F64, towards: F64) -> Bool:
         """(N,): does the mesh stand between points on the given faces and a light in the unit directions `towards`?"""
         hidden = np.zeros(len(face), bool)
         ask = np.flatnonzero(~self.free[face])
         if len(ask):
             origins = points[ask] + _OFFSET * self.size * self.normals[face[ask]]
-            hidden[ask] = self.mesh.ray.intersects_any(origins, towards[ask])
+            hidden[ask] = self.meets(origins, towards[ask])
         return hidden
 
     @cached_property

@@ -18,6 +18,7 @@ from hw.base.arrays import F64, I64, Bool
 from hw.base.errors import InputError
 from hw.interface import Aim
 from pipeline.geometry.camera import turn
+from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.geometry.projector import TwoMirrorProjector
 
@@ -80,7 +81,7 @@ def choose_spots(rig: RigConfig, mesh: trimesh.Trimesh) -> tuple[Aim, ...]:
 
 def _candidates(projectors: list[TwoMirrorProjector], mesh: trimesh.Trimesh, density: int) -> Candidates:
     """All aims of a density x density grid over the object's extent, per angle, that hit the object."""
-    parts = []
+    surface, parts = RayMesh.of(mesh), []
     for angle, projector in enumerate(projectors):
         extent = projector.steps_to(np.asarray(mesh.vertices, float))
         low = np.clip(np.ceil(extent.min(axis=0)), 0, projector.steps - 1)
@@ -89,9 +90,11 @@ def _candidates(projectors: list[TwoMirrorProjector], mesh: trimesh.Trimesh, den
         for rows in np.array_split(v, max(1, u.size * v.size // 1_000_000)):  # bounds the memory of a dense sweep
             steps = np.stack(np.meshgrid(u, rows), axis=-1).reshape(-1, 2)
             origin, direction = projector.rays(steps.astype(float))
-            face, ray, position = mesh.ray.intersects_id(origin, direction, multiple_hits=False, return_locations=True)
-            cosine = -np.einsum("ij,ij->i", mesh.face_normals[face], direction[ray])
-            parts.append(Candidates(np.full(len(ray), angle), steps[ray], np.reshape(position, (-1, 3)), cosine))
+            hit = surface.first_hit(origin, direction)
+            ray = np.flatnonzero(hit.triangle >= 0)
+            cosine = -np.einsum("ij,ij->i", surface.normals[hit.triangle[ray]], direction[ray])
+            position = origin[ray] + hit.distance[ray, None] * direction[ray]
+            parts.append(Candidates(np.full(len(ray), angle), steps[ray], position, cosine))
     return Candidates(
         np.concatenate([p.angle for p in parts]),
         np.concatenate([p.steps for p in parts]),

@@ -7,7 +7,6 @@ floodlit image, then the placement's spots in every laser. `targets.json` beside
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -155,8 +154,3 @@ def _plate_aims(rig: RigConfig, config: CameraConfig, pose: F64, index: int) -> 
     centre, half = (low + high) / 2, (high - low) / 2 * 0.75
     u, v = (np.rint(np.linspace(centre[k] - half[k], centre[k] + half[k], PLANE_GRID)).astype(int) for k in (0, 1))
     return series + [Aim(index, int(a), int(b)) for a in u for b in v]
-
-
-def save_targets(targets: Targets, path: Path) -> None:
-    """Write targets.json."""
-    path.write_text(targets.model_dump_json(indent=1) + "\n", encoding="utf-8")

@@ -8,6 +8,7 @@ import numpy as np
 
 from hw.base.errors import InputError
 from pipeline.geometry.camera import PinholeCamera, turn
+from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.nominal_rig import CameraConfig, Point, RigConfig
 
 if TYPE_CHECKING:
@@ -85,9 +86,10 @@ def _visible(camera: PinholeCamera, mesh: trimesh.Trimesh) -> tuple[float, float
     cells = np.clip(np.ceil(high - low), 1, GRID).astype(int)
     x, y = (low[k] + (np.arange(cells[k]) + 0.5) * (high[k] - low[k]) / cells[k] for k in (0, 1))
     origins, directions = camera.rays(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
-    points, ray, _ = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
-    if not len(ray):
+    distance = RayMesh.of(mesh).first_hit(origins, directions).distance
+    met = np.isfinite(distance)
+    if not met.any():
         return 0.0, 0.0
-    pixels = len(ray) / len(origins) * float(np.prod(high - low))
-    width = float(np.linalg.norm(points - origins[ray], axis=1).mean()) / camera.focal
+    pixels = float(met.mean() * np.prod(high - low))
+    width = float(distance[met].mean()) / camera.focal
     return pixels, pixels * float(np.prod(width))

@@ -26,7 +26,7 @@ from hw.record import to_radiance
 from pipeline.capture.loop import capture
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.plan.plan import make_plan
-from pipeline.plan.targets import BRACKET, FOLDER, TARGETS, Targets, make_bracket, make_targets, save_targets
+from pipeline.plan.targets import BRACKET, FOLDER, TARGETS, Targets, make_bracket, make_targets
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -190,7 +190,7 @@ def capture_targets(folder: Path, rig: TwinRigConfig, seed: int, camera: int) ->
     targets, plan = make_targets(rig, camera)
     source = TargetSource(targets, actual.cameras[camera], actual, rig.projector.beam_diameter_mm / 2)
     capture(TargetRig(rig, source, seed, actual, camera, len(targets.placements)), plan, folder)
-    save_targets(targets, folder / TARGETS)
+    (folder / TARGETS).write_text(targets.model_dump_json())
     return targets, source
 
 
