@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibrate_twin import faulty_rig, world
+from calibrate_twin import experiment, faulty_rig
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -18,8 +18,9 @@ from disco_twin.evaluate.stage_figures import StageOutputs, TrueRun, all_figures
 from disco_twin.faults.actual_rig import actual_rig
 from disco_twin.light.balance import EnergyBalance
 from disco_twin.light.truth import Truth
-from pipeline.calibrate.calibration import Calibration, nominal_calibration, pose_rows
-from pipeline.geometry.mesh import vertex_areas
+from pipeline.calibrate.calibration import Calibration, nominal_calibration
+from pipeline.geometry.camera import pose_rows
+from pipeline.geometry.mesh import RayMesh
 from pipeline.reconstruct.samples.distances import beam_footprints
 from pipeline.reconstruct.samples.spots import locate_spots
 from pipeline.reconstruct.settings import ReconstructConfig
@@ -31,14 +32,14 @@ COLUMNS = np.arange(5, 1500, 100)
 @cache
 def perfect() -> tuple[StageOutputs, TrueRun]:
     """The quick scene before a rig that is off, R_d that falls with distance, and outputs without any error."""
-    rig, scan, plan = faulty_rig(), world().scan, world().plan
+    rig, scan, plan = faulty_rig(), experiment().scan, experiment().plan
     calibration = true_calibration(rig, actual_rig(rig, 3), nominal_calibration(rig, lars3_sensor(rig)))
     spots = locate_spots(scan, calibration, plan, ReconstructConfig())
     distance = np.linalg.norm(scan.vertices[COLUMNS, None] - scan.vertices, axis=2)
     mean = np.stack([np.exp(-distance / length) / length**2 for length in (3.0, 4.0, 5.0)])
     zero: Any = np.zeros(3)
     balance = EnergyBalance(**dict.fromkeys(EnergyBalance.__dataclass_fields__, zero))
-    truth = Truth(COLUMNS, mean, 1e-6 * mean, vertex_areas(scan), balance)
+    truth = Truth(COLUMNS, mean, 1e-6 * mean, RayMesh.of(scan).vertex_areas, balance)
     values = np.full((3, len(plan.spots), len(scan.vertices)), np.nan)
     values[:, :, COLUMNS] = np.stack([beam_footprints(scan, spots) @ column.T for column in mean])
     image = np.random.default_rng(1).uniform(1.0, 2.0, (3, 12, 16))
