@@ -30,7 +30,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
 from scipy.stats import t as student
 
-from disco_twin.evaluate.stage_figures import (
+from benchmarks.stage_figures import (
     FIGURES,
     StageOutputs,
     TrueRun,
