@@ -95,7 +95,8 @@ class Rig(Protocol):
     def __enter__(self) -> Self: ...
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+    ) -> None:
+        self.make_safe()
 
     def now(self) -> float:
         """Seconds since the rig was switched on (the twin: a virtual clock)."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, model_validator
 
 from hw.base.config import Strict, as_table
+from hw.base.files import write_atomically
 from hw.record import Sensor
 from pipeline.geometry.nominal_rig import RigConfig
 
@@ -30,6 +32,16 @@ class SensorFile(Strict):
 
     format_version: Literal[1]
     sensor: Annotated[Sensor, as_table(Sensor)]
+
+
+def write_capture_records(capture: Path, scan_ply: bytes, rig: RigConfig, sensor: Sensor) -> None:
+    """CAPTURE/scan.ply, rig.json, sensor.json: what the pipeline is given beside the images and their plan."""
+    write_atomically(capture / "scan.ply", scan_ply)
+    for name, record in (
+        ("rig.json", NominalRigFile(format_version=1, rig=rig)),
+        ("sensor.json", SensorFile(format_version=1, sensor=sensor)),
+    ):
+        write_atomically(capture / name, record.model_dump_json(indent=1).encode())
 
 
 class Figures(Strict):

@@ -8,37 +8,26 @@ move. Serial traffic of an image fits into the frame that is discarded anyway, a
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from disco_twin.emulation.twin_rig import FRAMES_PER_IMAGE, TURN_S, Power, TwinRig
+from disco_twin.emulation.twin_rig import FRAMES_PER_IMAGE, TURN_S, TwinRig
 from disco_twin.firmware.mm_ard import MirrorHead
 from disco_twin.firmware.omicron import LaserHead
 from disco_twin.firmware.turning import Spindle
 from hw.base.clock import Clock
 from hw.base.errors import DiscoError, InputError
 from hw.devices.mm_ard import LINES, STEPS
+from hw.devices.omicron_protocol import Mode
 from hw.interface import Camera
 from hw.record import RawImage
+from hw.rig.limits import Subscriber
 
 FLOOD_LINE = LINES - 1  # the lasers' gates are lines 0, 1, 2
 LAMP_LINE = LINES - 2  # the warning lamp: high as long as the rig is armed
 AT_ANGLE_DEG = 0.01  # the object stands at a configured angle if it is as close as this
-
-
-@dataclass
-class EmittedPower:
-    """The twin's laser power times what its emulated head is set to."""
-
-    twin: Power
-    share: Callable[[int], float]
-
-    def watts(self, laser: int, time_s: float) -> float:
-        """Power on the object in watts."""
-        return self.twin.watts(laser, time_s) * self.share(laser)
 
 
 class Bench:
@@ -65,21 +54,8 @@ class Bench:
         self.spindle = Spindle(on_move=self.turned)
         self.cameras: list[Camera] = [BenchCamera(self, camera) for camera in twin.cameras]
         self.hazards: list[str] = []
-        twin.power = EmittedPower(twin.power, self._share)
-
-    # ---- the timebase of the record (hw.base.clock.Timebase)
-
-    def restart(self) -> None:
-        """The rig is ready: the twin starts at time 0."""
-        self.twin.__enter__()
-
-    def now(self) -> float:
-        """The twin's clock."""
-        return self.twin.now()
-
-    def resume_at(self, time_s: float) -> None:
-        """Continue an interrupted capture."""
-        self.twin.resume_at(time_s)
+        nominal = twin.watts
+        twin.watts = lambda laser, time_s: nominal(laser, time_s) * self._share(laser)
 
     # ---- what the devices do to the twin
 
@@ -178,3 +154,31 @@ class BenchCamera:
         raw = self.twin.expose()
         self.bench.clock.sleep(frame)
         return raw
+
+
+@dataclass
+class MirroredDevices(Subscriber):
+    """A bench whose devices do as real ones do: a real turntable turns the simulated object."""
+
+    bench: Bench
+
+    def laser(self, index: int, power_mw: float) -> None:
+        """The twin's laser emits this power, as long as it takes the real one to be steady behind it."""
+        head = self.bench.heads[index]
+        head.level, head.mode = power_mw / head.max_power_mw, int(Mode.BIAS | Mode.RELEASE)
+        head.on_since = -np.inf if power_mw else None
+
+    def mirrors(self, u: int, v: int) -> None:
+        """The twin's mirrors go there."""
+        for channel, value in enumerate((u, v)):
+            self.bench.board.write(channel, value, self.bench.clock.now())
+
+    def lines(self, pattern: int) -> None:
+        """The twin's gates and lamps, too."""
+        self.bench.board.set_pattern(pattern)
+
+    def turntable(self, angle_rad: float) -> None:
+        """The twin's object stands there."""
+        angle_deg = float(np.rad2deg(angle_rad))
+        self.bench.spindle = Spindle(angle_deg=angle_deg, homed=True, on_move=self.bench.turned)
+        self.bench.turned(angle_deg)

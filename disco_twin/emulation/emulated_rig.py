@@ -8,8 +8,7 @@ from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 
-from disco_twin.emulation.bench import Bench
-from disco_twin.emulation.mirrored_devices import MirroredDevices
+from disco_twin.emulation.bench import Bench, MirroredDevices
 from disco_twin.emulation.rig_file_of import emulated_rig_file
 from disco_twin.emulation.twin_rig import TwinRig
 from disco_twin.firmware.mm_ard import MmArdFirmware
@@ -32,9 +31,10 @@ class Emulation:
     def __init__(self, twin: TwinRig, clock: Clock | None = None) -> None:
         self.clock: Clock = VirtualClock() if clock is None else clock
         self.bench = Bench(twin, self.clock)
-        self.cables = {f"laser{i}": Cable(OmicronFirmware(head), self.clock) for i, head in enumerate(self.bench.heads)}
-        for i in range(len(self.bench.heads)):
-            self.cables[f"laser{i}"].on_closed = partial(self.bench.left, i)
+        self.cables: dict[str, Cable] = {}
+        for i, head in enumerate(self.bench.heads):
+            self.cables[f"laser{i}"] = cable = Cable(OmicronFirmware(head), self.clock)
+            cable.on_closed = partial(self.bench.left, i)
         self.cables["board"] = Cable(MmArdFirmware(self.bench.board), self.clock)
         self.cables["turntable"] = Cable(ZaberFirmware(self.bench.spindle), self.clock)
 
@@ -52,8 +52,8 @@ class Emulation:
         ports = self.attach() if ports is None else ports
         if not cameras:
             return StandIns(self.clock, ports)
-        bench = self.bench
-        return StandIns(self.clock, ports, bench.cameras, bench, bench.twin.announce, MirroredDevices(bench))
+        bench, twin = self.bench, self.bench.twin
+        return StandIns(self.clock, ports, bench.cameras, twin, twin.announce, MirroredDevices(bench))
 
     def serial_rig(self, logs: Path | None = None, urls: Mapping[str, str] | None = None) -> SerialRig:
         """The rig with everything emulated, reached through `urls`. logs: a folder for the byte logs."""

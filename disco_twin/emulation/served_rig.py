@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +16,7 @@ from disco_twin.emulation.twin_rig import TwinRig, watts_per_count
 from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.clock import WallClock
 from hw.base.errors import DiscoError, InputError
-from hw.base.files import require_folder, take_lock, write_atomically
+from hw.base.files import alone_in, require_folder, write_atomically
 from hw.interface import Aim
 
 F32 = NDArray[np.float32]
@@ -62,7 +61,8 @@ def served(scene: TwinRigConfig, seed: int, folder: Path) -> Iterator[Path]:
     require_folder(folder, "--ports")
     lines, path = emulated_devices(scene, seed).cables, folder / "rig.toml"
     remedy = "choose another --ports, or take it away"
-    with _alone_in(folder):
+    problem = "an emulator that is running serves its devices here"  # its links would be taken over and taken away
+    with alone_in(folder, InputError(problem, file=folder, remedy="end it, or choose another --ports")):
         for port in (folder / name for name in lines):
             if port.exists() and not port.is_symlink():
                 raise InputError("is in the place of an emulated device's port", file=port, remedy=remedy)
@@ -72,19 +72,3 @@ def served(scene: TwinRigConfig, seed: int, folder: Path) -> Iterator[Path]:
         with Server(lines, folder):
             write_atomically(path, content)
             yield path
-
-
-@contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Refuse a folder in which another emulator serves: its links would be taken over, and taken away at the end.
-
-    The lock is the folder's own and ends with its program, however that ends: nothing is left behind.
-    """
-    lock = os.open(folder, os.O_RDONLY)
-    try:
-        if not take_lock(lock):
-            problem, remedy = "an emulator that is running serves its devices here", "end it, or choose another --ports"
-            raise InputError(problem, file=folder, remedy=remedy)
-        yield
-    finally:
-        os.close(lock)

@@ -6,9 +6,8 @@ back to where it was and resumed meets the same times (and noise) as one that wa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from types import TracebackType
 from typing import Protocol, Self
 
 import numpy as np
@@ -20,7 +19,7 @@ from disco_twin.faults.light_faults import LaserPower, Stream, generator, speckl
 from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.errors import DiscoError, InputError, Refused
 from hw.devices.mm_ard import ADC_TOP
-from hw.interface import Aim, Camera, Floodlight, Laser, LaserReading, Photodiode, Projector, Turntable
+from hw.interface import Aim, LaserReading, Rig, Turntable
 from hw.record import RawImage
 from pipeline.geometry.nominal_rig import LaserConfig
 
@@ -57,18 +56,12 @@ class _Scene:
     flood: bool = False
 
 
-class Power(Protocol):
-    """What the lasers give."""
-
-    def watts(self, laser: int, time_s: float) -> float: ...
-
-
 def watts_per_count(laser: LaserConfig) -> float:
     """Of the photodiode's 10-bit converter (the MM-Ard board's), whose gain is set for each laser."""
     return PHOTODIODE_RANGE * laser.power_mw * 1e-3 / ADC_TOP
 
 
-class TwinRig:
+class TwinRig(Rig):
     """`hw.interface.Rig` without hardware: nominal `config`, light from `source`, everything random from `seed`."""
 
     def __init__(
@@ -76,15 +69,13 @@ class TwinRig:
     ) -> None:
         actual = actual_rig(config, seed) if actual is None else actual
         self.config, self.source, self.seed, self.actual = config, source, seed, actual
-        self.power: Power = LaserPower(config.lasers, config.faults, seed)
-        self.lasers: Sequence[Laser] = [TwinLaser(self, i) for i in range(len(config.lasers))]
-        self.projector: Projector = TwinProjector(self)
+        self.watts: Callable[[int, float], float] = LaserPower(config.lasers, config.faults, seed).watts
+        self.lasers = [TwinLaser(self, i) for i in range(len(config.lasers))]
+        self.projector = TwinProjector(self)
         self.turntable: Turntable = TwinTurntable(self)
-        self.cameras: Sequence[Camera] = [
-            TwinCamera(self, i, Lars3.of(config, camera)) for i, camera in enumerate(actual.cameras)
-        ]
-        self.photodiode: Photodiode = TwinPhotodiode(self)
-        self.floodlight: Floodlight = TwinFloodlight(self)
+        self.cameras = [TwinCamera(self, i, Lars3.of(config, camera)) for i, camera in enumerate(actual.cameras)]
+        self.photodiode = TwinPhotodiode(self)
+        self.floodlight = TwinFloodlight(self)
         self.powered = False
         self.clock = 0.0
         self.scene = self._home = _Scene(0, config.projector.steps // 2, config.projector.steps // 2)
@@ -92,15 +83,14 @@ class TwinRig:
         self._exposed: dict[int, tuple[_Scene, int]] = {}  # camera -> its last scene and how often it saw it before
 
     def __enter__(self) -> Self:
+        self.restart()
+        return self
+
+    def restart(self) -> None:
+        """Power on, at time 0 (`hw.base.clock.Timebase`)."""
         self.powered, self.clock, self.scene = True, 0.0, self._home
         self.counts, self.reading = 0, 0.0
         self._exposed.clear()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.make_safe()
 
     def exponent(self) -> int | None:
         """The exposure that all pixels take; None: each decides for itself."""
@@ -276,7 +266,7 @@ class TwinCamera:
         address = (self.index, scene.angle, u, v, scene.gate + 1, int(scene.flood))
         repeats = rig.repeats(self.index)
         frame = rig.config.sensor.longest_exposure_s
-        watts = 0.0 if scene.gate < 0 else rig.power.watts(scene.gate, rig.clock + (FRAMES_PER_IMAGE - 0.5) * frame)
+        watts = 0.0 if scene.gate < 0 else rig.watts(scene.gate, rig.clock + (FRAMES_PER_IMAGE - 0.5) * frame)
         noise = generator(rig.seed, Stream.PHOTODIODE, *address, repeats).standard_normal()
         raw = self.optics.expose(
             self._radiance(watts, address),

@@ -10,9 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -20,7 +19,7 @@ from typing import Annotated, Literal
 from disco_twin.scene.scene import Scene
 from hw.base.config import Strict, as_table, read_json
 from hw.base.errors import DiscoError, InputError
-from hw.base.files import take_lock, write_atomically, write_json
+from hw.base.files import alone_in, write_atomically, write_json
 from hw.base.resources import measured
 from pipeline.stream.files import IMAGES, JOURNAL
 
@@ -152,17 +151,10 @@ class RunFolder:
                 record.peak_mb = max(record.peak_mb, usage.peak_mb if child is None else child)
             self._save()
 
-    @contextmanager
-    def alone(self) -> Iterator[None]:
+    def alone(self) -> AbstractContextManager[None]:
         """No other process works in the folder meanwhile."""
-        handle = os.open(self.root, os.O_RDONLY)
-        try:
-            if not take_lock(handle):
-                problem = f"{self.root}: another process works in this folder"
-                raise DiscoError(f"{problem}. Remedy: wait for it, or choose another --out")
-            yield
-        finally:
-            os.close(handle)
+        problem = f"{self.root}: another process works in this folder"
+        return alone_in(self.root, DiscoError(f"{problem}. Remedy: wait for it, or choose another --out"))
 
     def _load(self) -> None:
         data = read_json(self.journal, _Journal, "choose another --out")

@@ -11,7 +11,7 @@ from disco_twin.object import shapes
 from disco_twin.object.media import Medium, build_medium
 from disco_twin.object.mesh import check_size, hat_basis, read_mesh, remesh
 from disco_twin.object.scanner import scan_points
-from disco_twin.scene.object_schema import MOST_VERTICES, Box, MeshFile, ObjectConfig, Pebble, Sphere, Torus
+from disco_twin.scene.object_schema import MOST_VERTICES, Box, MeshFile, Pebble, Shape, Sphere, Torus
 from hw.base.errors import InputError
 from pipeline.geometry.surface_from_points import reconstruct_surface
 
@@ -44,14 +44,11 @@ class TwinObject:
 
 def build_object(scene: Scene) -> TwinObject:
     """The object of a scene. Raises: InputError for a mesh or a medium that cannot be traced."""
-    config = scene.object
-    mesh = _mesh(config)
-    kind = config.boundary.kind
-    boundary = Boundary(
-        kind, 1.0 if kind == "matched" else config.boundary.eta, config.boundary.alpha if kind == "rough" else 0.0
-    )
+    mesh, surface = _mesh(scene.object.shape), scene.object.boundary
+    rough = surface.kind == "rough"
+    boundary = Boundary("rough", surface.eta, surface.alpha) if rough else Boundary("matched", 1.0, 0.0)
     wavelengths = [laser.wavelength_nm for laser in scene.rig.lasers]
-    return TwinObject(mesh, boundary, build_medium(config.medium, mesh, wavelengths))
+    return TwinObject(mesh, boundary, build_medium(scene.object.medium, mesh, wavelengths))
 
 
 def build_scan(scene: Scene, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -62,13 +59,12 @@ def build_scan(scene: Scene, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     vertices, shape = scene.scan.vertices, scene.object.shape
     if vertices is None:
         if len(mesh.vertices) > MOST_VERTICES:
-            raise InputError(
+            problem = (
                 f"left out, the scan is the object's own mesh of {len(mesh.vertices)} vertices, and R_d holds the "
-                "square of that for every laser",
-                key="scan.vertices",
-                allowed=f"at most {MOST_VERTICES}",
-                remedy="set scan.vertices",
+                "square of that for every laser"
             )
+            allowed, remedy = f"at most {MOST_VERTICES}", "set scan.vertices"
+            raise InputError(problem, key="scan.vertices", allowed=allowed, remedy=remedy)
         return mesh
     if scene.rig.faults.scanner:
         return reconstruct_surface(*scan_points(mesh, scene.seed), vertices).mesh
@@ -77,20 +73,17 @@ def build_scan(scene: Scene, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return remesh(mesh, vertices)
 
 
-def _mesh(config: ObjectConfig) -> trimesh.Trimesh:
-    shape = config.shape
-    if isinstance(shape, MeshFile):
-        return read_mesh(shape.file)
-    mesh = _procedural(shape)
+def _mesh(shape: Shape) -> trimesh.Trimesh:
+    match shape:
+        case MeshFile():
+            return read_mesh(shape.file)
+        case Pebble():
+            mesh = shapes.pebble(shape)
+        case Sphere():
+            mesh = shapes.sphere(shape)
+        case Box():
+            mesh = shapes.box(shape)
+        case Torus():
+            mesh = shapes.torus(shape)
     check_size(mesh, "object.shape")
     return mesh
-
-
-def _procedural(shape: Pebble | Sphere | Box | Torus) -> trimesh.Trimesh:
-    if isinstance(shape, Pebble):
-        return shapes.pebble(shape)
-    if isinstance(shape, Sphere):
-        return shapes.sphere(shape)
-    if isinstance(shape, Box):
-        return shapes.box(shape)
-    return shapes.torus(shape)

@@ -1,7 +1,7 @@
 """The laser range scanner of the twin: points on the object's surface, off by what thesis figure 4.8 shows.
 
 A bare translucent object is seen too deep, by about a free path, and noisily: the light of the scanner's stripe leaves
-below the surface (Godin et al. 2001). A coat of spray ends that, and leaves its own thickness.
+below the surface (Godin et al. 2001). So it is sprayed: the coat ends that, and leaves its own thickness.
 """
 
 from __future__ import annotations
@@ -17,21 +17,17 @@ F64 = NDArray[np.float64]
 POINTS = 40_000
 NOISE_MM, COAT_MM = 0.05, 0.02  # of single points; thickness of the spray
 ERROR_MM, ERROR_LENGTH_MM, LARGEST_MM = 0.1, 10.0, 0.3  # geometry error: rms, correlation length, bound (thesis 4.4)
-BARE_DEPTH, BARE_NOISE = 0.5, 0.3  # of a free path: how much too deep a bare object is seen, and how noisily
 WAVES = 256
 
 
-def scan_points(mesh: trimesh.Trimesh, seed: int, free_path_mm: float = 0.0, sprayed: bool = True) -> tuple[F64, F64]:
-    """(N, 3) points in mm and (N, 3) unit normals; free_path_mm matters for a bare object."""
+def scan_points(mesh: trimesh.Trimesh, seed: int) -> tuple[F64, F64]:
+    """(N, 3) points in mm and (N, 3) unit normals."""
     rng = generator(seed, Stream.SCANNER)
     points, face = trimesh.sample.sample_surface_even(mesh, POINTS, seed=int(rng.integers(2**31)))
     normals = np.asarray(mesh.face_normals)[face]
     error = np.clip(geometry_error(points, rng), -LARGEST_MM, LARGEST_MM)
     error += NOISE_MM * rng.standard_normal(len(points))
-    if sprayed:
-        error += COAT_MM
-    else:
-        error += free_path_mm * (-BARE_DEPTH + BARE_NOISE * rng.standard_normal(len(points)))
+    error += COAT_MM
     return np.asarray(points + error[:, None] * normals), normals
 
 

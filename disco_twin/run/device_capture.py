@@ -9,12 +9,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.emulation.emulated_rig import open_scene_rig
 from disco_twin.emulation.served_rig import Darkness
 from disco_twin.emulation.twin_rig import TwinRig
 from disco_twin.experiment.keys import content_key
 from disco_twin.run import simulate
-from disco_twin.run.scan import sensor_of, write_scan
+from disco_twin.run.scan import write_scan
 from hw.base.errors import InputError, naming
 from hw.base.files import require_folder, write_atomically
 from hw.rig.rig_file import EMULATED, DevicesFile
@@ -35,11 +36,8 @@ def open_rig_file(run: Run, path: Path, armed: bool) -> DevicesFile:
     require_scene(file, run.scene.rig, path)
     if file.real_lasers and not armed:
         ports = ", ".join(laser.port for laser in file.lasers if laser.port != EMULATED)
-        raise InputError(
-            f"real lasers will emit ({ports})",
-            file=path,
-            remedy="see to interlock, door and goggles, then repeat the command with --arm",
-        )
+        remedy = "see to interlock, door and goggles, then repeat the command with --arm"
+        raise InputError(f"real lasers will emit ({ports})", file=path, remedy=remedy)
     require_reach(file, run.experiment.plan, path)
     folder = run.folder
     if (folder.capture / IMAGES).exists() and not folder.taken_by_devices:
@@ -74,11 +72,11 @@ def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool
         require_folder(logs, "--logs")
     if not _has_images(folder.capture):  # what the images are begun with is kept
         write_atomically(folder.devices_record, path.read_bytes())
-    real = None if file.sensor is None or file.simulated_cameras else file.sensor.sensor()
-    sensor = sensor_of(experiment, real)
+    real = None if file.simulated_cameras else file.sensor
+    sensor = lars3_sensor(run.scene.rig) if real is None else real.sensor()
     key = content_key(folder.identity, "devices")
     scan_key = content_key(key, repr(sensor))  # the sensor may be corrected before the first image
-    run.stage("scan", scan_key, lambda _: write_scan(experiment, folder.capture, real))
+    run.stage("scan", scan_key, lambda _: write_scan(experiment, folder.capture, sensor))
 
     def take_images(report: Report) -> None:
         with naming(path), open_scene_rig(file, run.scene.rig, _twin(run, file), logs, armed=armed) as rig:

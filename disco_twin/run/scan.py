@@ -7,26 +7,20 @@ from pathlib import Path
 from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.experiment.experiment import Experiment
 from hw.base.errors import InputError
-from hw.base.files import write_atomically
 from hw.record import Sensor
 from pipeline.calibrate.projector_fit import LEAST_SPOTS
 from pipeline.plan.visibility import require_in_sight
-from pipeline.records import NominalRigFile, SensorFile
-
-
-def sensor_of(experiment: Experiment, real: Sensor | None = None) -> Sensor:
-    """The sensor as the pipeline is given it: a real camera's, or the twin's."""
-    return lars3_sensor(experiment.scene.rig) if real is None else real
+from pipeline.records import write_capture_records
 
 
 def write_scan(experiment: Experiment, capture: Path, sensor: Sensor | None = None) -> None:
-    """The nominal rig, its sensor, the scanned mesh. Raises: InputError, see `require_capturable`."""
+    """The nominal rig, its sensor (the twin's, unless it is given), the scanned mesh.
+
+    Raises: InputError, see `require_capturable`.
+    """
     require_capturable(experiment)
-    rig = NominalRigFile(format_version=1, rig=experiment.scene.rig.nominal())
-    known = SensorFile(format_version=1, sensor=sensor_of(experiment, sensor))
-    write_atomically(capture / "scan.ply", bytes(experiment.scan.export(file_type="ply")))
-    write_atomically(capture / "rig.json", rig.model_dump_json(indent=1).encode())
-    write_atomically(capture / "sensor.json", known.model_dump_json(indent=1).encode())
+    rig, scan = experiment.scene.rig, bytes(experiment.scan.export(file_type="ply"))
+    write_capture_records(capture, scan, rig.nominal(), lars3_sensor(rig) if sensor is None else sensor)
 
 
 def require_capturable(experiment: Experiment) -> None:

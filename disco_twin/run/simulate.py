@@ -8,7 +8,7 @@ from disco_twin.emulation.twin_rig import TwinRig
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.keys import code_key
 from disco_twin.faults.actual_rig import actual_rig
-from pipeline.capture.loop import CaptureReport, Progress, capture
+from pipeline.capture.loop import Progress, capture
 
 SPOT_CODE = "disco_twin.light.response"
 
@@ -25,6 +25,6 @@ def twin_rig(experiment: Experiment, responses: Path) -> TwinRig:
     return TwinRig(scene.rig, light, scene.seed, actual)
 
 
-def take_images(experiment: Experiment, folder: Path, responses: Path, progress: Progress) -> CaptureReport:
+def take_images(experiment: Experiment, folder: Path, responses: Path, progress: Progress) -> None:
     """The capture into `folder`; continues where it was interrupted."""
-    return capture(twin_rig(experiment, responses), experiment.plan, folder, progress)
+    capture(twin_rig(experiment, responses), experiment.plan, folder, progress)

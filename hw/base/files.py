@@ -16,7 +16,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hw.base.errors import InputError
+from hw.base.errors import DiscoError, InputError
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -101,6 +101,21 @@ def take_lock(handle: int) -> bool:
     except BlockingIOError:
         return False
     return True
+
+
+@contextmanager
+def alone_in(folder: Path, refusal: DiscoError) -> Iterator[None]:
+    """A block in which no other process works in a folder; the lock ends with its program, however that ends.
+
+    Raises: `refusal` where another process is in such a block.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        if not take_lock(handle):
+            raise refusal
+        yield
+    finally:
+        os.close(handle)
 
 
 def require_folder(folder: Path, option: str) -> None:

@@ -29,21 +29,16 @@ class Usage:
 def measured() -> Iterator[Usage]:
     """Measure a block. On Linux its peak is its own; elsewhere it is the process's so far (an upper bound)."""
     usage = Usage()
-    _reset_peak()
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # Linux: resets the process's high-water mark
+    except OSError as error:  # sandboxes may forbid it
+        log.debug("the peak of memory counts from the process's beginning: %s", error)
     start = time.perf_counter()
     try:
         yield usage
     finally:
         usage.seconds += time.perf_counter() - start
         usage.peak_mb = max(usage.peak_mb, peak_memory_mb())
-
-
-def _reset_peak() -> None:
-    """Linux resets a process's high-water mark when 5 is written to clear_refs; sandboxes may forbid it."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError as error:
-        log.debug("the peak of memory counts from the process's beginning: %s", error)
 
 
 def peak_memory_mb() -> float:
@@ -54,12 +49,8 @@ def peak_memory_mb() -> float:
                 return float(line.split()[1]) / 1024.0
     except OSError as error:
         log.debug("%s: asking getrusage instead", error)  # no /proc (macOS)
-    return _maxrss_mb(resource.getrusage(resource.RUSAGE_SELF))
-
-
-def _maxrss_mb(usage: resource.struct_rusage) -> float:
-    """`ru_maxrss` is in bytes on macOS and in KiB elsewhere."""
-    return usage.ru_maxrss / (MIB if sys.platform == "darwin" else 1024.0)
+    largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return largest / (MIB if sys.platform == "darwin" else 1024.0)  # in bytes on macOS and in KiB elsewhere
 
 
 def total_memory_gb() -> float:

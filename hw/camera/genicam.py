@@ -7,7 +7,6 @@ a `Grabber`: five methods that any GenTL client can offer. `hw.camera.viva_grabb
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -88,7 +87,7 @@ class GenicamCamera:
 
     def expose(self) -> RawImage:
         """The bracket, from the longest exposure down, as far as some pixel is still saturated. Raises: CameraError."""
-        return self.bracket.merge(self._frames())
+        return self.bracket.merge((exponent, self._frame(exponent)) for exponent in self.bracket.exponents)
 
     def black_level(self, frames: int = 4) -> tuple[float, float]:
         """Mean and standard deviation, in digital numbers, of the shortest exposure; the rig is dark meanwhile."""
@@ -99,10 +98,6 @@ class GenicamCamera:
     def close(self) -> None:
         """Give the camera back."""
         self.grabber.close()
-
-    def _frames(self) -> Iterator[tuple[int, U16]]:
-        for exponent in self.bracket.exponents:
-            yield exponent, self._frame(exponent)
 
     def _set_exposure(self, exponent: int) -> float:
         wanted = self.bracket.exposure_s(exponent)

@@ -17,15 +17,9 @@ import numpy as np
 
 from hw.base.clock import Clock, Timebase, WallClock
 from hw.base.errors import DeviceError, DeviceFault, InputError
-from hw.devices.elliptec import BAUD as ELLIPTEC_BAUD
-from hw.devices.elliptec import ElliptecTable
-from hw.devices.mm_ard import BAUD as BOARD_BAUD
+from hw.devices import elliptec, mm_ard, ophir, zaber
 from hw.devices.omicron import OFF_SHARE, OmicronLaser
-from hw.devices.ophir import BAUD as OPHIR_BAUD
-from hw.devices.ophir import OphirMeter
 from hw.devices.turning import TurntableDriver
-from hw.devices.zaber import BAUD as ZABER_BAUD
-from hw.devices.zaber import ZaberTable
 from hw.interface import Aim, Camera
 from hw.rig.drivers import Board, Drivers, close_all
 from hw.rig.limits import LimitedBoard, PlacedTable, Subscriber
@@ -131,29 +125,29 @@ class Connector:
         raise InputError(problem, file=self.file.path, key=f"lasers[{index}].power_mw", value=power_mw,
                          allowed=allowed, remedy=remedy)  # fmt: skip
 
-    def meter(self) -> OphirMeter:
+    def meter(self) -> ophir.OphirMeter:
         """The power meter's driver. Raises: InputError without [power_meter]."""
         if self.file.power_meter is None:
             remedy = "add the table [power_meter]"
             raise InputError("the rig file has no power meter", file=self.file.path, key="power_meter", remedy=remedy)
-        return self._opened("power_meter.port", OPHIR_BAUD, "power meter", "power_meter", OphirMeter)
+        return self._opened("power_meter.port", ophir.BAUD, "power meter", "power_meter", ophir.OphirMeter)
 
     def board(self) -> LimitedBoard:
         """The board's driver, which keeps the mirrors within their limits; connecting shuts every line."""
         device = self.file.board
         limits, subscriber = (device.limits_u, device.limits_v), self._subscriber(device.port)
         driver = partial(LimitedBoard, limits=limits, subscriber=subscriber)
-        return self._opened("board.port", BOARD_BAUD, "mirror board", "board", driver)
+        return self._opened("board.port", mm_ard.BAUD, "mirror board", "board", driver)
 
     def table(self) -> TurntableDriver:
         """The turntable's driver, in angles of the rig."""
         device = self.file.turntable
-        baud = ZABER_BAUD if isinstance(device, ZaberDevice) else ELLIPTEC_BAUD
+        baud = zaber.BAUD if isinstance(device, ZaberDevice) else elliptec.BAUD
 
         def driver(link: Link) -> TurntableDriver:
             if isinstance(device, ZaberDevice):
-                return ZaberTable(link, device.microsteps_per_deg, device.reach_s, device.device, device.axis)
-            return ElliptecTable(link, device.address, device.reach_s)
+                return zaber.ZaberTable(link, device.microsteps_per_deg, device.reach_s, device.device, device.axis)
+            return elliptec.ElliptecTable(link, device.address, device.reach_s)
 
         table = self._opened("turntable.port", baud, "turntable", "turntable", driver)
         zero_rad, subscriber = float(np.deg2rad(device.zero_deg)), self._subscriber(device.port)

@@ -12,12 +12,11 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from hw.base.clock import Elapsed, Timebase
 from hw.base.errors import InputError, Refused
-from hw.interface import Aim, Camera, Floodlight, Laser, LaserReading, Photodiode, Projector, Turntable
+from hw.interface import Aim, Camera, LaserReading, Rig
 from hw.rig.connect import Connector, StandIns, keys_named, open_camera, require_black
 from hw.rig.drivers import Drivers
 from hw.rig.emission import begin_emission, check_lasers, require_light
@@ -26,7 +25,7 @@ from hw.rig.verified_board import VerifiedBoard
 from hw.safety.signals import uninterrupted
 
 
-class SerialRig:
+class SerialRig(Rig):
     """`hw.interface.Rig` over drivers. Devices are connected on entering, so that entering again reconnects."""
 
     def __init__(
@@ -47,12 +46,12 @@ class SerialRig:
         self._drivers: Drivers | None = None
         self._board: VerifiedBoard | None = None
         self.last_open = -1  # the laser whose gate was opened last: whose photodiode is to be read
-        self.lasers: Sequence[Laser] = [GatedLaser(self, i) for i in range(len(self.file.lasers))]
-        self.projector: Projector = Mirrors(self)
-        self.turntable: Turntable = SafeTurntable(self)
-        self.cameras: Sequence[Camera] = list(cameras)
-        self.photodiode: Photodiode = AdcPhotodiode(self)
-        self.floodlight: Floodlight = TtlFloodlight(self)
+        self.lasers = [GatedLaser(self, i) for i in range(len(self.file.lasers))]
+        self.projector = Mirrors(self)
+        self.turntable = SafeTurntable(self)
+        self.cameras = list(cameras)
+        self.photodiode = AdcPhotodiode(self)
+        self.floodlight = TtlFloodlight(self)
 
     # ---- on and off
 
@@ -79,11 +78,6 @@ class SerialRig:
             raise
         self._timebase.restart()
         return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.make_safe()
 
     def make_safe(self) -> None:
         """Gates shut, lasers and lamps off, ports given back. No device's failure stops another's, or is raised.

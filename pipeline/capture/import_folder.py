@@ -27,13 +27,12 @@ from pydantic import Field
 from hw.base.arrays import U16
 from hw.base.config import NearbyFile, Strict, as_table, load_toml
 from hw.base.errors import InputError
-from hw.base.files import write_atomically
 from hw.camera.bracket import Bracket
 from hw.interface import Aim
 from hw.record import Sensor
 from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.plan.plan import ImageAddress, Plan
-from pipeline.records import NominalRigFile, SensorFile
+from pipeline.records import write_capture_records
 from pipeline.stream.layout import ImageMeta
 from pipeline.stream.stream import StreamWriter
 
@@ -74,27 +73,16 @@ def import_capture(folder: Path, out: Path, progress: Callable[[int, int], None]
 
     Raises: InputError, with the line of the table where there is one.
     """
-    described = load_toml(
-        folder / "capture.toml", CaptureDescription, "a capture.toml (docs/lab.md, section 6, shows one)"
-    )
+    what = "a capture.toml (docs/lab.md, section 6, shows one)"
+    described = load_toml(folder / "capture.toml", CaptureDescription, what)
     table = folder / "images.csv"
     brackets = _read_table(table, described)
     plan = _plan(table, described.rig, brackets)
-    bracket = Bracket(
-        described.sensor.longest_exposure_s,
-        tuple(range(described.sensor.steps)),
-        described.sensor.bits,
-        described.saturation_dn,
-    )
+    sensor = described.sensor
+    exponents = tuple(range(sensor.steps))
+    bracket = Bracket(sensor.longest_exposure_s, exponents, sensor.bits, described.saturation_dn)
     with StreamWriter(out, plan) as stream:
-        write_atomically(out / "scan.ply", _scan(described.scan))
-        write_atomically(
-            out / "rig.json", NominalRigFile(format_version=1, rig=described.rig).model_dump_json(indent=1).encode()
-        )
-        write_atomically(
-            out / "sensor.json",
-            SensorFile(format_version=1, sensor=described.sensor).model_dump_json(indent=1).encode(),
-        )
+        write_capture_records(out, _scan(described.scan), described.rig, sensor)
         for index in range(len(stream), len(plan)):
             address = plan.address(index)
             frames = brackets[_key(plan, address)]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 from hw.base.errors import DiscoError, InputError
@@ -31,23 +30,10 @@ class Interrupted(DiscoError):
     """The user asked to stop; every image that was reported as stored is."""
 
 
-@dataclass(frozen=True)
-class CaptureReport:
-    """What is in the folder now. `resumed_at`: images that were there before; bytes of images.bin and uncompressed."""
+def capture(rig: Rig, plan: Plan, folder: Path, progress: Progress | None = None, sensor: Sensor | None = None) -> int:
+    """Take the images of the plan that are not yet stored in the folder; how many were there before.
 
-    images: int
-    resumed_at: int
-    views: int
-    spots: int
-    lasers: int
-    bytes_raw: int
-    bytes_stored: int
-
-
-def capture(
-    rig: Rig, plan: Plan, folder: Path, progress: Progress | None = None, sensor: Sensor | None = None
-) -> CaptureReport:
-    """Take the images of the plan that are not yet stored in the folder. The rig is safe whenever this ends.
+    The rig is safe whenever this ends.
 
     Ctrl-C (or another signal of `hw.safety.signals`) is obeyed at once, since lasers must go out: the image in progress
     is dropped, to be taken again, and `Interrupted` raised. The folder of another plan is refused before the rig is
@@ -73,9 +59,7 @@ def capture(
                 finally:
                     interruption.ignoring = True
                     rig.make_safe()  # once more: entering the rig may have failed half-way, leaving it been interrupted
-    with StreamReader(folder) as stored:
-        raw, size = stored.bytes_raw(), stored.bytes_stored
-    return CaptureReport(len(plan), resumed_at, plan.views, len(plan.spots), plan.lasers, raw, size)
+    return resumed_at
 
 
 def _require_match(rig: Rig, plan: Plan) -> None:

@@ -227,21 +227,6 @@ class GuardedPort(SerialBase):
             raise GuardClosed(self.gone(0.0) or f"its guard has closed it: {error.strerror}") from error
         return len(data)
 
-    def reset_input_buffer(self) -> None:
-        """Forget what has arrived."""
-        waiting = self.in_waiting
-        if waiting:
-            self._open_host().recv(waiting)
-
-    def reset_output_buffer(self) -> None:
-        """Nothing waits to be sent: the guard takes everything at once."""
-
-    def flush(self) -> None:
-        """Nothing waits to be sent."""
-
-    def _reconfigure_port(self) -> None:
-        """The guard set the baud rate when it opened the port."""
-
 
 def serial_class_for_url(url: str) -> tuple[str, type[GuardedPort]]:
     """What `serial.serial_for_url` asks a handler for."""

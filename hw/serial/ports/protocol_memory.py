@@ -6,6 +6,8 @@ Emulated devices and replayed logs attach themselves here, so that drivers open 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 from serial import PortNotOpenError, SerialBase, SerialException
@@ -40,11 +42,6 @@ def attach(name: str, peer: Peer) -> str:
     return PREFIX + name.lower()
 
 
-def detach(name: str) -> None:
-    """Make the name unreachable again."""
-    _PEERS.pop(name.lower(), None)
-
-
 class MemoryPort(SerialBase):
     """The computer's end of a memory port."""
 
@@ -67,55 +64,33 @@ class MemoryPort(SerialBase):
         if peer is not None:
             peer.closed()
 
-    def _open_peer(self) -> Peer:
+    @contextmanager
+    def _use(self) -> Iterator[Peer]:
+        """The peer. A port that has failed once stays dead until it is opened again."""
         if self._peer is None:
             raise PortNotOpenError
-        return self._peer
-
-    def _failed(self, error: OSError) -> SerialException:
-        """A port that has failed once stays dead until it is opened again."""
-        self._peer, self.is_open = None, False
-        return SerialException(str(error))
+        try:
+            yield self._peer
+        except OSError as error:
+            self._peer, self.is_open = None, False
+            raise SerialException(str(error)) from error
 
     @property
     def in_waiting(self) -> int:
         """Bytes that can be read without waiting."""
-        peer = self._open_peer()
-        try:
+        with self._use() as peer:
             return peer.waiting()
-        except OSError as error:
-            raise self._failed(error) from error
 
     def read(self, size: int = 1, /) -> bytes:
         """At most `size` bytes within the port's timeout."""
-        peer = self._open_peer()
-        try:
+        with self._use() as peer:
             return peer.deliver(size, self.timeout or 0.0)
-        except OSError as error:
-            raise self._failed(error) from error
 
     def write(self, data: bytes, /) -> int:  # type: ignore[override]
         """Hand over all bytes."""
-        peer = self._open_peer()
-        try:
+        with self._use() as peer:
             peer.receive(bytes(data))
-        except OSError as error:
-            raise self._failed(error) from error
         return len(data)
-
-    def reset_input_buffer(self) -> None:
-        """Forget what has arrived."""
-        peer = self._open_peer()
-        peer.deliver(peer.waiting(), 0.0)
-
-    def reset_output_buffer(self) -> None:
-        """Nothing waits to be sent: the peer takes everything at once."""
-
-    def flush(self) -> None:
-        """Nothing waits to be sent."""
-
-    def _reconfigure_port(self) -> None:
-        """A memory port has no settings."""
 
 
 def serial_class_for_url(url: str) -> tuple[str, type[MemoryPort]]:

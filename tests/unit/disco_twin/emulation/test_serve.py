@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import serial
 from capture_fakes import contents
+from replay import ReplayPeer, read_log
 from serial_fakes import ScaledClock
 from twin_fakes import PLAN, RIG, Glow
 
@@ -33,7 +34,7 @@ from hw.devices.mm_ard import MirrorBoard
 from hw.devices.omicron import OmicronLaser
 from hw.devices.omicron_protocol import Mode
 from hw.devices.zaber import ZaberTable
-from hw.serial.bytelog import ByteLog, ReplayPeer, read_log
+from hw.serial.bytelog import ByteLog
 from hw.serial.link import Link
 from hw.serial.ports.protocol_memory import attach
 from pipeline.capture.loop import capture

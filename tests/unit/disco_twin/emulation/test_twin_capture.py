@@ -19,5 +19,5 @@ def test_resumed_capture_equals_the_uninterrupted_one(tmp_path: Path, fail_at: i
     capture(TwinRig(RIG, Glow(), seed=5), PLAN, whole)
     with pytest.raises(RuntimeError, match="out of light"):
         capture(TwinRig(RIG, Glow(fail_at), seed=5), PLAN, parts)
-    assert capture(TwinRig(RIG, Glow(), seed=5), PLAN, parts).resumed_at == fail_at
+    assert capture(TwinRig(RIG, Glow(), seed=5), PLAN, parts) == fail_at
     assert contents(parts) == contents(whole)

@@ -306,7 +306,7 @@ def test_limits_zero_and_direction(tmp_path: Path) -> None:
 
 def test_a_laser_that_is_too_weak_is_refused(tmp_path: Path) -> None:
     with open_scene_rig(rig_file(tmp_path, text()), RIG, twin := TwinRig(RIG, Glow(), seed=5), armed=True) as rig:
-        heads = rig._connector.stand_ins.timebase.heads  # type: ignore[attr-defined]
+        heads = rig._connector.stand_ins.subscriber.bench.heads  # type: ignore[attr-defined]
         type(heads[1]).emission, before = (lambda self, now: 0.8 * self.level), type(heads[1]).emission
         try:
             with pytest.raises(DeviceFault, match=r"laser 635 nm emits 8.00 mW instead of 10 mW \(allowed: 10 % off\)"):

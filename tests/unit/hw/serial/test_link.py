@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from replay import ReplayPeer, read_log
 from serial_fakes import BoardBench, Bus, LaserBench, TableBench
 
 from disco_twin.firmware.wire import lost
@@ -18,7 +19,7 @@ from hw.base.errors import DiscoError, InputError, Unplugged
 from hw.devices.omicron import OmicronLaser
 from hw.devices.omicron_protocol import OmicronFramer
 from hw.devices.zaber import ZaberFramer, checksum, parse
-from hw.serial.bytelog import HEADER, ByteLog, Event, ReplayPeer, read_log
+from hw.serial.bytelog import HEADER, ByteLog, Event
 from hw.serial.link import Framer, Inbox, LineFramer, Link
 from hw.serial.ports.protocol_memory import attach
 
