@@ -259,11 +259,11 @@ def test_emulated_devices_take_nobodys_place(tmp_path: Path, says: Says) -> None
     [
         (["rig"], "Missing command. Remedy: `disco-twin rig --help`"),
         (["rig", "prob"], "No such command 'prob'"),
-        (["rig", "probe"], "Missing argument 'RIG.TOML'. Remedy: `disco-twin rig probe --help` says what is allowed"),
+        (["rig", "probe"], "Missing argument 'RIG.TOML'. Remedy: `disco-twin rig probe --help` lists what is allowed"),
         (["rig", "probe", "a", "b"], "Got unexpected extra argument"),
         (["rig", "selftest", "a", "--armed"], "No such option: --armed"),
         (["rig", "emulate", "a", "--ports", "b", "--seconds", "x"], "Invalid value for '--seconds'"),
-        (["capture", "a"], "Missing option '--out'. Remedy: `disco-twin capture --help` says what is allowed"),
+        (["capture", "a"], "Missing option '--out'. Remedy: `disco-twin capture --help` lists what is allowed"),
     ],
 )
 def test_a_wrong_command_is_one_line(says: Says, words: list[str], said: str) -> None:
