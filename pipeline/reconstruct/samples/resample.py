@@ -163,10 +163,15 @@ class BatchResult:
 
 
 def _single(matrix: Any) -> sparse.csr_array:
-    """The matrix in single precision and with short indices: what is read once per image should be small."""
+    """The matrix in single precision and with short indices: what is read once per image should be small.
+
+    Its indices are sorted: scipy's abs() sorts them in place, which must not happen while other threads read.
+    """
     m = sparse.csr_array(matrix)
     short = m.indices.astype(np.int32), m.indptr.astype(np.int32)
-    return sparse.csr_array((m.data.astype(np.float32), *short), shape=m.shape)
+    out = sparse.csr_array((m.data.astype(np.float32), *short), shape=m.shape)
+    out.sum_duplicates()
+    return out
 
 
 def look_up(sensor: Sensor, laser: int) -> tuple[F32, F32]:

@@ -124,6 +124,19 @@ def test_equals_the_plain_computation(capture: tuple[Path, trimesh.Trimesh, Cali
     assert any(result.lost for result in results)
 
 
+def test_reading_leaves_the_operators_alone(capture: tuple[Path, trimesh.Trimesh, Calibration]) -> None:
+    """Rationale: threads share them, and scipy sorts indices in place where a record is saturated.
+    Expected behaviour: the same arrays afterwards, to the bit.
+    """
+    folder, mesh, calibration = capture
+    with StreamReader(folder) as stream:
+        readers = [ViewReader.of(v, calibration, mesh, readings_of(mesh, calibration, v)) for v in range(2)]
+        kept = [(o.indices.copy(), o.data.copy(), o) for reader in readers for o in reader.operators.values()]
+        results = list(resample(stream, calibration, readers, np.ones(len(stream.plan.spots)), {}))
+    assert sum(result.saturated for result in results)
+    assert all(np.array_equal(i, o.indices) and np.array_equal(d, o.data) for i, d, o in kept)
+
+
 def test_a_record_that_does_not_fit_the_sensor_is_refused(
     capture: tuple[Path, trimesh.Trimesh, Calibration], tmp_path: Path
 ) -> None:
