@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.references import reference_path
 from disco_twin.experiment.run_folder import RunFolder
+from hw.base.arrays import F32, Bool
 from hw.base.config import Strict, read_json
 from hw.base.errors import InputError
 from hw.base.files import write_json
@@ -28,7 +28,6 @@ log = logging.getLogger(__name__)
 
 FORMAT_VERSION = 1
 KEPT = ("nrmse", "nrmse_se", "nrmse_floor", "psnr", "energy_ratio")
-F32 = NDArray[np.float32]
 
 
 class _Scores(Strict):
@@ -90,7 +89,7 @@ def score_images(
     return rows
 
 
-def usable_score(what: str, image: F32, a: F32, b: F32, mask: NDArray[np.bool_]) -> dict[str, float | None]:
+def usable_score(what: str, image: F32, a: F32, b: F32, mask: Bool) -> dict[str, float | None]:
     """The kept figures of `score_relit`; all None, with a warning, where they cannot be had or are not finite."""
     from pipeline.relight.scores import Unscorable, score_relit
 

@@ -10,15 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.camera.sensor import expected_variance
 from disco_twin.light import MOST_CAMERAS
 from disco_twin.scene.scene import Scene
 from pipeline.geometry.camera import PinholeCamera
-
-F64 = NDArray[np.float64]
 
 RADIANCES = np.geomspace(1e-12, 1e-3, 400)  # W/(mm^2 sr), from below the camera's noise to its saturation
 FILES = 3  # of simulated spots that are looked at, evenly spread

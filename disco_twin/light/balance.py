@@ -6,9 +6,8 @@ import logging
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from hw.base.arrays import F64
 
 log = logging.getLogger(__name__)
 

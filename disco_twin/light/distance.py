@@ -13,12 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from disco_twin.object.mesh import distance_to
-
-F32 = NDArray[np.float32]
+from hw.base.arrays import F32, F64, I64
 
 NEAR = 8.0  # cells from the surface within which distances are exact
 
@@ -31,7 +29,7 @@ class DistanceField:
 
     distance: F32
     normal: F32
-    low: NDArray[np.float64]
+    low: F64
     cell: float
 
     @property
@@ -39,7 +37,7 @@ class DistanceField:
         return len(self.distance)
 
 
-def sample_surface(mesh: trimesh.Trimesh, spacing: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def sample_surface(mesh: trimesh.Trimesh, spacing: float) -> tuple[F64, I64]:
     """Points that leave no surface point farther than `spacing` from one of them: (n, 3) and their faces (n,).
 
     Every triangle gets a barycentric lattice of k steps, its longest edge / k <= spacing: any point of the triangle

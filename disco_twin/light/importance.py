@@ -16,13 +16,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
 from disco_twin.object.build import TwinObject
-
-F64 = NDArray[np.float64]
+from hw.base.arrays import F64, I64, Bool
 
 CELLS = 32  # along the object's longest side
 INNER_POINTS = 3  # of each cell and axis, at which the medium is read
@@ -49,8 +48,8 @@ class Diffusion:
     outside; both indexed [z, y, x]; low: corner in mm; cell: edge in mm; factor: solves for the fluence of 1 W, 1/mm^2.
     """
 
-    filled: NDArray[np.bool_]
-    number: NDArray[np.int64]
+    filled: Bool
+    number: I64
     low: F64
     cell: float
     factor: Any
@@ -126,7 +125,7 @@ def diffusion(obj: TwinObject, laser: int, cells: int = CELLS) -> Diffusion:
     return Diffusion(filled, number[tuple(nearest)], corner, cell, factor)
 
 
-def window_targets(fluence: F64, filled: NDArray[np.bool_], effort: float) -> F64:
+def window_targets(fluence: F64, filled: Bool, effort: float) -> F64:
     """(N, n, n, n) target weights: min(1, fluence / f), with the f at which `effort` times the collisions are made.
 
     Photons of weight w are met fluence / w times: the fluence itself without windows, and max(fluence, f) with them,

@@ -11,11 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
+from hw.base.arrays import F32, F64, I64
 
 STRETCHES = (2, 4, 8, 16)  # cells that a flight may move along each axis, tried
 WORTHWHILE = 0.8  # share of the flights, above which one majorant for all does as well
@@ -51,7 +49,7 @@ def greatest_in_cells(sigma_t: F64, medium_low: F64, medium_high: F64, low: F64,
 
 
 def local_majorants(
-    sigma_t: F64, medium_low: F64, medium_high: F64, low: F64, cell: float, cells: int, inside: NDArray[np.int64]
+    sigma_t: F64, medium_low: F64, medium_high: F64, low: F64, cell: float, cells: int, inside: I64
 ) -> LocalMajorants | None:
     """The majorants whose stretch asks for the fewest flights in the cells `inside`, (N, 3) indices [z, y, x]; None
     where one for all does nearly as well, or where the object is thinner than the cells.

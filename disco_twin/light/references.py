@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hw.base.arrays import F32
 from hw.base.errors import InputError
 from hw.base.files import require_version
 from pipeline.geometry.camera import PinholeCamera
@@ -22,7 +22,6 @@ from pipeline.relight.lights import Light
 if TYPE_CHECKING:
     from disco_twin.light.transport import Transport
 
-F32 = NDArray[np.float32]
 
 FORMAT_VERSION = 1
 RENDER_AGAIN = "delete it, disco-twin run renders it again"

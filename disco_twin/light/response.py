@@ -14,12 +14,13 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from disco_twin.faults.actual_rig import ActualRig
 from disco_twin.light.sources import BeamSource, Source
 from disco_twin.light.transport import Transport
 from disco_twin.object.build import TwinObject
+from hw.base.arrays import F32
 from hw.base.errors import refused_by_the_disk
 from hw.base.files import replacing
 from hw.interface import Aim
@@ -28,7 +29,6 @@ from pipeline.geometry.nominal_rig import RigConfig
 
 log = logging.getLogger(__name__)
 
-F32 = NDArray[np.float32]
 
 CHUNK = 20  # spots simulated together and kept in one file
 FLOODLIGHT = 2e-5  # W/(mm^2 sr) that a white surface shows face on

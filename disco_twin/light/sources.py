@@ -14,13 +14,11 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 from disco_twin.light import sampling
 from disco_twin.light.sampling import Rng
+from hw.base.arrays import F64, I64
 from pipeline.relight.lights import Colour, Directional, Environment, Light, TexturedProjector, Uniform
-
-F64 = NDArray[np.float64]
 
 
 def weight_type(lasers: int) -> Any:
@@ -74,7 +72,7 @@ class HatSource:
     hats: per tag the (V,) values of a non-negative function at the mesh's vertices (its hat function).
     """
 
-    def __init__(self, vertices: F64, faces: NDArray[np.int64], hats: F64, lasers: int) -> None:
+    def __init__(self, vertices: F64, faces: I64, hats: F64, lasers: int) -> None:
         a, b, c = (vertices[faces[:, k]] for k in range(3))
         area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
         corner_face, corner_slot, cdf, start = [], [], [], [0]

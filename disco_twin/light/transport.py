@@ -22,10 +22,8 @@ from disco_twin.light.splitting import Window
 from disco_twin.light.tables import FAR
 from disco_twin.light.walk import Tally, walk
 from disco_twin.object.build import Medium, TwinObject
+from hw.base.arrays import F32, F64, I64
 from pipeline.geometry.camera import PinholeCamera
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
 
 LANES = 1 << 15
 PHOTONS_PER_CALL = 1 << 22
@@ -99,7 +97,7 @@ class Transport:
         return to_float(self._field.distance)
 
     @cached_property
-    def _inside(self) -> NDArray[np.int64]:
+    def _inside(self) -> I64:
         """(N, 3) indices [z, y, x] of cells of the distance field that lie in the object: every fourth per axis."""
         field = self._field
         index = np.stack(np.meshgrid(*[np.arange(2, field.cells, 4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -294,7 +292,7 @@ def wavelength_groups(medium: Medium) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(g) for g in groups)
 
 
-def mesh_scene(vertices: F64, faces: NDArray[np.int64], bsdf: dict[str, Any]) -> mi.Scene:
+def mesh_scene(vertices: F64, faces: I64, bsdf: dict[str, Any]) -> mi.Scene:
     """A Mitsuba scene of one mesh with flat (geometric) normals: exact reciprocity, no weight lost to shading."""
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf)

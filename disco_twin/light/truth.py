@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from disco_twin.light.balance import EnergyBalance
+from hw.base.arrays import F64, I64
 from hw.base.files import load_arrays, save_arrays
 from pipeline.geometry.fresnel import mean_transmittance
 from pipeline.geometry.mesh import RayMesh
@@ -22,7 +22,6 @@ from pipeline.geometry.mesh import RayMesh
 if TYPE_CHECKING:
     from disco_twin.light.transport import Transport
 
-F64 = NDArray[np.float64]
 
 REPLICATES = 8
 FORMAT_VERSION = 2
@@ -37,7 +36,7 @@ class Truth:
     `REPLICATES` independent replicates; area: (V,) integral of each hat function in mm^2; balance: where light went.
     """
 
-    columns: NDArray[np.int64]
+    columns: I64
     mean: F64
     standard_error: F64
     area: F64
@@ -62,9 +61,7 @@ def hat_areas(transport: Transport, basis: sparse.csr_matrix) -> F64:
     return np.asarray(basis.T @ RayMesh.of(transport.object.mesh).vertex_areas)
 
 
-def truth_columns(
-    transport: Transport, basis: sparse.csr_matrix, columns: NDArray[np.int64], walks: int, seed: int
-) -> Truth:
+def truth_columns(transport: Transport, basis: sparse.csr_matrix, columns: I64, walks: int, seed: int) -> Truth:
     """R_d[u, v] = (escaped power weighted by hat v) / (area of v * Tbar^2) per watt that falls on hat u.
 
     basis: (V_fine, V) the hat functions' values at the vertices of the mesh that light is traced on; walks: a column.

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from disco_twin.evaluate.scores import load_model, load_relit, load_scores
 from disco_twin.experiment.experiment import Experiment, mm_per_pixel
@@ -19,8 +18,6 @@ from disco_twin.report.page import ReportData
 from hw.record import Sensor
 from pipeline.calibrate.calibration import Calibration
 from pipeline.geometry.nominal_rig import RigConfig
-
-F64 = NDArray[np.float64]
 
 SPOTS_SHOWN = 4
 

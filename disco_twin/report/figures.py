@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hw.base.arrays import F32, F64, Bool
 from pipeline.reconstruct.registry import known_methods
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 STYLE = Path(__file__).with_name("templates") / "figures.mplstyle"
 
@@ -77,7 +75,7 @@ class Comparison:
     view: str
     reference: F32
     relit: Mapping[str, F32]
-    mask: NDArray[np.bool_]
+    mask: Bool
     mm_per_pixel: float
     nrmse: Mapping[str, float]
 

@@ -11,16 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from numpy.typing import NDArray
 
 from disco_twin.evaluate.summary import figure_or_dash, pooled, rms
 from disco_twin.report import figures
+from hw.base.arrays import F64
 from hw.base.files import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-F64 = NDArray[np.float64]
 Summary = Mapping[str, Any]
 
 BROAD = ("uniform", "directional", "environment")

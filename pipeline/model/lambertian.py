@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
+from hw.base.arrays import F32
 from pipeline.geometry.mesh import RayMesh
-from pipeline.model.term import F32, Axes, Term
+from pipeline.model.term import Axes, Term
 from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 
 

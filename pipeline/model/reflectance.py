@@ -9,7 +9,8 @@ from typing import Annotated, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.model.term import F32, Axes, ReflectanceColumns, Term
+from hw.base.arrays import F32
+from pipeline.model.term import Axes, ReflectanceColumns, Term
 from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 
 _PAIRS = "laser vertex_in vertex_out"

@@ -11,13 +11,14 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from hw.base.arrays import F32
 from hw.base.errors import InputError
 from hw.base.files import load_arrays, save_arrays
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import Boundary
 from pipeline.model.lambertian import LambertianTerm
 from pipeline.model.reflectance import GlobalTerm
-from pipeline.model.term import F32, ReflectanceColumns, Term
+from pipeline.model.term import ReflectanceColumns, Term
 from pipeline.relight.lights import Light
 from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 

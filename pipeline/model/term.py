@@ -14,9 +14,8 @@ from typing import Any, ClassVar, Self, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from hw.base.arrays import F32, I64, Bool
 from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
-
-F32 = NDArray[np.float32]
 
 
 class Axes:
@@ -34,7 +33,7 @@ class ReflectanceColumns:
 
     mean: NDArray[np.floating]
     variance: NDArray[np.floating] | None
-    measured: NDArray[np.bool_]
+    measured: Bool
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class Term(ABC):
     def image(self, light: LightOnMesh, view: ViewOfMesh) -> F32:
         """(L, H, W) radiance in W/(mm^2 sr) that the term adds, averaged over each pixel."""
 
-    def reflectance_columns(self, vertices: Sequence[int] | NDArray[np.int64]) -> ReflectanceColumns | None:
+    def reflectance_columns(self, vertices: Sequence[int] | I64) -> ReflectanceColumns | None:
         """The term's part of R_d from these vertices to all; None where it states none between different points."""
         return None
 

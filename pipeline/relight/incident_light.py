@@ -7,13 +7,11 @@ Lights with one direction per point (directional, beam, projector) answer in clo
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hw.base.arrays import F64
 from hw.base.errors import InputError
 from pipeline.geometry.camera import look_at
 from pipeline.relight.lights import Beam, Directional, Environment, Light, TexturedProjector, Uniform
-
-F64 = NDArray[np.float64]
 
 _GOLDEN = 0.6180339887498949  # turns from one direction to the next: a Fibonacci lattice
 _SHIFT = 0.7548776662466927  # turns from one point's lattice to the next point's, so that their errors average out

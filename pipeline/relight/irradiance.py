@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import linalg as sparse_linalg
 
 from hw.base.arrays import F64, I64
@@ -53,7 +52,7 @@ class Accuracy:
 
 def received(
     surface: RayMesh, light: Light, face: I64, points: F64, eta: float | Boundary, lasers: int, directions: int = 256
-) -> NDArray[np.float64]:
+) -> F64:
     """(L, N) transmitted flux density T in W/mm^2 at (N, 3) points on (N,) faces. eta = 1: the plain irradiance."""
     if isinstance(light, Uniform | Environment):
         return _received_from_many(surface, light, face, points, eta, lasers, directions)
@@ -90,7 +89,7 @@ def _received_from_many(
     return total
 
 
-def irradiance(light: Light, mesh: trimesh.Trimesh, face: I64, points: F64, lasers: int) -> NDArray[np.float64]:
+def irradiance(light: Light, mesh: trimesh.Trimesh, face: I64, points: F64, lasers: int) -> F64:
     """(L, N) plain irradiance in W/mm^2 at (N, 3) points on (N,) faces: no boundary, shadows of the mesh included."""
     return received(RayMesh.of(mesh), light, face, points, 1.0, lasers, directions=1024)
 
@@ -117,7 +116,7 @@ def _split(face: I64, bary: F64) -> tuple[I64, F64]:
 
 def _moments(
     surface: RayMesh, light: Light, face: I64, bary: F64, eta: float | Boundary, lasers: int, directions: int
-) -> NDArray[np.float64]:
+) -> F64:
     """(L, C, 3) integrals of T times the face's three hat functions over each cell, in W."""
     at = np.einsum("pj,cjb->cpb", _RULE, bary)  # (C, 3 points, 3)
     flat = at.reshape(-1, 3)
@@ -129,7 +128,7 @@ def _moments(
 
 def hat_moments(
     light: Light, mesh: trimesh.Trimesh, eta: float | Boundary, lasers: int, accuracy: Accuracy | None = None
-) -> NDArray[np.float64]:
+) -> F64:
     """(L, V) integrals of hat_u T dA in W; they add up to all the flux that passes the boundary."""
     accuracy = accuracy or Accuracy()
     surface = RayMesh.of(mesh)
@@ -161,7 +160,7 @@ def hat_moments(
 
 def transmitted_flux(
     light: Light, mesh: trimesh.Trimesh, eta: float | Boundary, lasers: int, accuracy: Accuracy | None = None
-) -> NDArray[np.float64]:
+) -> F64:
     """(L, V) flux q in W for radiosity = sum_u R_d[u, :] q_u, with R_d averaged over hat functions.
 
     q = A M^-1 (moments), with the mass matrix M and the vertex areas A: the flux density is projected onto the hat

@@ -7,9 +7,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from hw.base.arrays import F32, F64
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import Boundary, transmittance
 from pipeline.geometry.pixel_footprints import SurfaceHits, trace_pixels
@@ -18,8 +18,6 @@ from pipeline.relight.lights import Light
 
 if TYPE_CHECKING:
     import trimesh
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +71,7 @@ class ViewOfMesh:
         shape = self.camera.height, self.camera.width
         return np.bincount(self.rays.pixel, minlength=shape[0] * shape[1]).reshape(shape) / self.supersample**2
 
-    def image(self, radiosity: F64) -> NDArray[np.float32]:
+    def image(self, radiosity: F64) -> F32:
         """(L, V) radiosity in W/mm^2 -> (L, H, W) radiance in W/(mm^2 sr), averaged over each pixel."""
         flat = np.asarray(self.matrix @ np.asarray(radiosity, np.float64).T)
         return np.moveaxis(flat.reshape(self.camera.height, self.camera.width, -1), -1, 0).astype(np.float32)

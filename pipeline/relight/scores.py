@@ -11,9 +11,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-F64 = NDArray[np.float64]
+from hw.base.arrays import F64, Bool
+
 BLOCK = 8  # pixels: noise is taken as uncorrelated between blocks of this size, and between nothing smaller
 
 
@@ -48,7 +49,7 @@ def signed_root(square: float) -> float:
     return math.copysign(math.sqrt(abs(square)), square)
 
 
-def _block_sums(values: F64, mask: NDArray[np.bool_]) -> F64:
+def _block_sums(values: F64, mask: Bool) -> F64:
     """(L, N) values on the mask's pixels -> sums over wavelengths and BLOCK x BLOCK pixels, 1-D."""
     rows, columns = np.nonzero(mask)
     block = (rows // BLOCK) * (mask.shape[1] // BLOCK + 1) + columns // BLOCK
@@ -60,7 +61,7 @@ def _tone(image: F64, exposure: float) -> F64:
     return np.asarray(np.clip(image / exposure, 0.0, 1.0) ** (1 / 2.2))
 
 
-def score_relit(image: ArrayLike, half_a: ArrayLike, half_b: ArrayLike, mask: NDArray[np.bool_]) -> RelitScore:
+def score_relit(image: ArrayLike, half_a: ArrayLike, half_b: ArrayLike, mask: Bool) -> RelitScore:
     """Scores of `image` against a reference in two independent halves.
 
     image, half_a, half_b: (L, H, W) linear radiance in W/(mm^2 sr); mask: (H, W), the object's pixels.

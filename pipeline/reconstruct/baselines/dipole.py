@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from hw.base.arrays import F64
 from pipeline.geometry.fresnel import Boundary
 from pipeline.geometry.mesh import RayMesh
 from pipeline.model.reflectance import GlobalTerm
@@ -15,8 +15,6 @@ from pipeline.reconstruct.global_term.radial_profile import over_directions
 from pipeline.reconstruct.registry import method
 from pipeline.reconstruct.samples.distances import Kernel
 from pipeline.reconstruct.samples.samples import Samples
-
-F64 = NDArray[np.float64]
 
 BINS = 24
 FAINTEST = 1e-3  # bins further below the first are left to noise

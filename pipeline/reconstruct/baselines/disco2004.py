@@ -11,19 +11,16 @@ from __future__ import annotations
 import logging
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg
 
+from hw.base.arrays import F32, F64, I64, Bool
 from pipeline.geometry.fresnel import Boundary
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.completion import measured_entries
 from pipeline.reconstruct.registry import method
 from pipeline.reconstruct.samples.samples import Samples
-
-F64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +48,7 @@ def distribute(samples: Samples, laser: int) -> tuple[F64, Bool]:
     return np.where(known, total / np.maximum(weight, 1e-3), 0.0), known
 
 
-def neighbours(vertices: F64, edges: NDArray[np.int64]) -> sparse.csr_array:
+def neighbours(vertices: F64, edges: I64) -> sparse.csr_array:
     """(V, V) graph Laplacian with weights 1 / e_nr: minus the sum over neighbours of (F_n - F_r) / e_nr."""
     inverse = 1.0 / np.maximum(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1), 1e-9)
     both = np.concatenate([edges, edges[:, ::-1]])
@@ -73,7 +70,7 @@ def fill(values: F64, known: Bool, laplacian: sparse.csr_array) -> F64:
     degree = np.asarray(operator.diagonal())
     half = (~fixed).astype(np.float32) / np.sqrt(degree[:, None] + degree[None, :])  # 0 where nothing is sought
 
-    def apply(entries: NDArray[np.float32]) -> NDArray[np.float32]:
+    def apply(entries: F32) -> F32:
         along = operator @ entries  # entries is symmetric: the same along rows is its transpose
         return np.asarray(half * (along + along.T))
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hw.base.arrays import F64
 from pipeline.geometry.fresnel import Boundary
 from pipeline.geometry.mesh import RayMesh
 from pipeline.model.lambertian import LambertianTerm
@@ -14,8 +14,6 @@ from pipeline.reconstruct.global_term.harmonics import harmonics
 from pipeline.reconstruct.global_term.radial_profile import over_directions
 from pipeline.reconstruct.registry import method
 from pipeline.reconstruct.samples.samples import Samples
-
-F64 = NDArray[np.float64]
 
 ALBEDO_NOISE = 0.2  # of a spot's energy relative to its deviation from the mean, in the interpolation
 

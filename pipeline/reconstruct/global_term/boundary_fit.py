@@ -12,14 +12,12 @@ from collections.abc import Callable
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from hw.base.arrays import F64
 from pipeline.geometry.fresnel import Boundary, transmittance
 from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.pixel_footprints import trace_pixels
 from pipeline.reconstruct.samples.samples import SpotSumImage
-
-F64 = NDArray[np.float64]
 
 EDGES = np.array([0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0 + 1e-9])
 LEAST, MOST = 0.5, 2.0  # of the smooth transmittance; at the outline itself scan and object do not meet
