@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from disco_twin.evaluate.summary import load_summary
 from disco_twin.report.collect import comparisons, impulses
 from disco_twin.report.figures import Comparison, Impulse, new_figure, plain, tone
 from disco_twin.run.stages import reopen_run
@@ -43,7 +43,7 @@ def main(run: Path, target: Path) -> None:
     from rich.console import Console
 
     opened = reopen_run(run, None, Console())
-    summary = load_summary(opened.folder.summary_file)
+    summary = json.loads(opened.folder.summary_file.read_text())
     method = summary["method"]
     sensor = Calibration.load(opened.folder.work / "calibration.json").sensor
     spots = [row[0] for row in impulses(opened.scene.rig, opened.folder.capture, sensor)[0]]

@@ -12,15 +12,16 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from disco_twin.camera.lens import Glare
+from disco_twin.evaluate.scores import score_relit_images
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.pipeline_process import reconstruct_apart
 from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.faults.actual_rig import ActualRig, actual_rig
 from disco_twin.scene.rig_schema import TwinRigConfig
+from hw.base.arrays import F64
 from hw.base.errors import InputError
 from hw.base.files import write_json
 from pipeline.calibrate.calibration import Calibration, ProjectorCalibration, nominal_calibration, pair
@@ -79,7 +80,7 @@ def _projector(own: Calibration, true: Calibration) -> Calibration:
     return own.model_copy(update={"projectors": _seen_from(true.projectors, object_frames(own, true))})
 
 
-def object_frames(here: Calibration, there: Calibration) -> list[NDArray[np.float64]]:
+def object_frames(here: Calibration, there: Calibration) -> list[F64]:
     """Per turntable angle, (4, 4) one calibration's object frame -> another's: a rotation, the mean of the views."""
     frames = []
     for j in range(here.n_angles):
@@ -90,9 +91,7 @@ def object_frames(here: Calibration, there: Calibration) -> list[NDArray[np.floa
     return frames
 
 
-def _seen_from(
-    projectors: Sequence[ProjectorCalibration], frames: Sequence[NDArray[np.float64]]
-) -> tuple[ProjectorCalibration, ...]:
+def _seen_from(projectors: Sequence[ProjectorCalibration], frames: Sequence[F64]) -> tuple[ProjectorCalibration, ...]:
     """The projectors in other frames, given the (4, 4) transform from each to theirs."""
     poses = [pose_rows(np.array(p.object_to_projector) @ f) for p, f in zip(projectors, frames, strict=True)]
     return tuple(p.model_copy(update={"object_to_projector": x}) for p, x in zip(projectors, poses, strict=True))
@@ -108,8 +107,6 @@ VARIANTS: dict[str, Callable[[Calibration, Calibration], Calibration]] = {
 
 def score_budget(experiment: Experiment, folder: RunFolder, method: str) -> list[dict[str, Any]]:
     """Rows {calibration, light, view, nrmse, ...} of one method: as measured, uncalibrated, and each part made true."""
-    from disco_twin.evaluate.scores import score_relit_images
-
     scene = experiment.scene
     own = Calibration.load(folder.work / "calibration.json")
     if own.source != "measured":
@@ -129,6 +126,5 @@ def score_budget(experiment: Experiment, folder: RunFolder, method: str) -> list
         calibration.save(given)
         reconstruct_apart(scene, variant, (method,), given)
         rows += [{"calibration": name} | row for row in score_relit_images(experiment, variant, (method,))]
-    record = {"format_version": FORMAT_VERSION, "method": method, "rows": rows}
-    write_json(folder.twin / RECORD, record)
+    write_json(folder.twin / RECORD, {"format_version": FORMAT_VERSION, "method": method, "rows": rows})
     return rows

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -16,14 +16,18 @@ from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.pipeline_process import load_results
 from disco_twin.experiment.references import reference_path
 from disco_twin.experiment.run_folder import RunFolder
+from disco_twin.light.references import HALVES, LAYERS, load_reference
+from disco_twin.light.truth import Truth
+from disco_twin.scene.scene import Scene
 from hw.base.errors import InputError
-
-if TYPE_CHECKING:
-    from disco_twin.scene.scene import Scene
-    from hw.record import RawImage
-    from pipeline.calibrate.calibration import Calibration
-    from pipeline.model.relightable import RelightableModel
-    from pipeline.reconstruct.samples.samples import Samples
+from hw.record import RawImage
+from pipeline.calibrate.calibration import Calibration
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.model.relightable import RelightableModel
+from pipeline.plan.plan import ImageAddress
+from pipeline.reconstruct.samples.samples import Samples
+from pipeline.reconstruct.samples.samples_file import load_samples
+from pipeline.stream.stream import StreamReader
 
 T = TypeVar("T")
 AXES = {"model": "method", "light": "light", "view": "view"}  # of the scores, and what their rows call them
@@ -54,15 +58,11 @@ class SpotImages:
     """Random access to the capture's images. `view` counts camera by camera, turntable angle by angle."""
 
     def __init__(self, folder: RunFolder) -> None:
-        from pipeline.stream.stream import StreamReader
-
         self._folder, self.reader = folder, StreamReader(folder.capture)
 
     @cached_property
     def calibration(self) -> Calibration:
         """What the pipeline measured of cameras, poses and projector, or the nominal rig."""
-        from pipeline.calibrate.calibration import Calibration
-
         return Calibration.load(self._folder.work / "calibration.json")
 
     def raw(self, view: int, spot: int, laser: int) -> xr.Dataset:
@@ -78,8 +78,6 @@ class SpotImages:
         return xr.Dataset({name: _array(getattr(image, name), "row column", unit) for name, unit in parts.items()})
 
     def _read(self, view: int, spot: int, laser: int) -> RawImage:
-        from pipeline.plan.plan import ImageAddress
-
         return self.reader.read(ImageAddress(view, "spot", spot, laser))
 
 
@@ -126,8 +124,6 @@ class OpenedRun:
     @cached_property
     def method_input(self) -> Samples:
         """What a method is given (read by footprint): `reconstruct(run.method_input, "mine")`."""
-        from pipeline.reconstruct.samples.samples_file import load_samples
-
         self._finished("pipeline")
         return load_samples(self.folder.work / "samples.npz")
 
@@ -155,8 +151,6 @@ class OpenedRun:
     @cached_property
     def truth(self) -> xr.Dataset:
         """True R_d from some vertices (`vertex_in`) to all. Compare with a model's `reflectance_columns`."""
-        from disco_twin.light.truth import Truth
-
         self._finished("truth")
         truth, dims = Truth.load(self.folder.twin / "truth.npz"), "laser vertex_in vertex"
         arrays = {
@@ -169,8 +163,6 @@ class OpenedRun:
     @cached_property
     def references(self) -> xr.DataArray:
         """Mitsuba's images in two independent halves; a model of R_d answers for the layer `subsurface`."""
-        from disco_twin.light.references import HALVES, LAYERS, load_reference
-
         self._finished("references")
         lights, views, folder = self.scene.relight.lights, self.scene.relight.views, self.folder.twin / "references"
         loaded = [[load_reference(reference_path(folder, light, view)).halves for view in views] for light in lights]
@@ -193,8 +185,6 @@ class OpenedRun:
 
     def relight(self, model: RelightableModel) -> xr.DataArray:
         """Images of a model under the scene's lights in its held-out views, named as those of `relit`."""
-        from pipeline.geometry.camera import PinholeCamera
-
         lights = {light.name: model.lit_by(light) for light in self.scene.relight.lights}
         views = {v.name: model.seen_by(PinholeCamera.from_config(v)) for v in self.scene.relight.views}
         return self._pictures(lambda light, view: model.image(lights[light], views[view.name]))

@@ -8,21 +8,23 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.references import reference_path
 from disco_twin.experiment.run_folder import RunFolder
+from disco_twin.light.references import LAYERS, load_reference
+from disco_twin.light.truth import Truth
 from hw.base.arrays import F32, Bool
 from hw.base.config import Strict, read_json
 from hw.base.errors import InputError
 from hw.base.files import write_json
-
-if TYPE_CHECKING:
-    from pipeline.geometry.nominal_rig import CameraConfig
-    from pipeline.model.relightable import RelightableModel
+from pipeline.geometry.nominal_rig import CameraConfig
+from pipeline.model.relightable import RelightableModel
+from pipeline.relight.lights import Light
+from pipeline.relight.scores import Unscorable, score_reflectance, score_relit
 
 log = logging.getLogger(__name__)
 
@@ -74,14 +76,11 @@ def score_images(
 
     image_of: method, light, view -> (L, H, W) relit image in W/(mm^2 sr)
     """
-    from disco_twin.light.references import LAYERS, load_reference
-
     rows = []
     masks = {view.name: experiment.object_mask(view) for view in experiment.scene.relight.views}
-    layer = LAYERS.index("subsurface")  # R_d answers for light from below the surface
     for light in experiment.scene.relight.lights:
         for view in experiment.scene.relight.views:
-            a, b = load_reference(reference_path(folder.twin / "references", light, view)).halves[:, layer]
+            a, b = reference_halves(folder, light, view)
             for method in methods:
                 image = image_of(method, light.name, view)
                 row = {"light": light.name, "view": view.name, "method": method}
@@ -91,8 +90,6 @@ def score_images(
 
 def usable_score(what: str, image: F32, a: F32, b: F32, mask: Bool) -> dict[str, float | None]:
     """The kept figures of `score_relit`; all None, with a warning, where they cannot be had or are not finite."""
-    from pipeline.relight.scores import Unscorable, score_relit
-
     try:
         score = asdict(score_relit(image, a, b, mask))
         if not all(math.isfinite(score[k]) for k in KEPT if score[k] is not None):
@@ -101,6 +98,11 @@ def usable_score(what: str, image: F32, a: F32, b: F32, mask: Bool) -> dict[str,
         log.warning("no score for %s: %s", what, why)
         return dict.fromkeys(KEPT)
     return {k: score[k] for k in KEPT}
+
+
+def reference_halves(folder: RunFolder, light: Light, view: CameraConfig) -> F32:
+    """(2, L, H, W) both halves of a reference, W/(mm^2 sr): the light from below the surface, which R_d answers for."""
+    return load_reference(reference_path(folder.twin / "references", light, view)).halves[:, LAYERS.index("subsurface")]
 
 
 def load_relit(folder: RunFolder, method: str, light: str, view: CameraConfig) -> F32:
@@ -121,8 +123,6 @@ def load_relit(folder: RunFolder, method: str, light: str, view: CameraConfig) -
 
 def load_model(folder: RunFolder, method: str) -> RelightableModel:
     """A method's model. Raises: InputError where its file is missing, damaged or of another version."""
-    from pipeline.model.relightable import RelightableModel
-
     return RelightableModel.load(folder.work / f"model-{method}.npz")
 
 
@@ -132,9 +132,6 @@ def score_reflectances(folder: RunFolder, models: Mapping[str, Callable[[], Reli
 
     A method whose R_d cannot be scored has None; one whose model states no R_d is left out.
     """
-    from disco_twin.light.truth import Truth
-    from pipeline.relight.scores import Unscorable, score_reflectance
-
     truth = Truth.load(folder.twin / "truth.npz")
     out: dict[str, Any] = {}
     for method, model in models.items():

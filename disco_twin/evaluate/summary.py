@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,26 +10,9 @@ import numpy as np
 from disco_twin.evaluate.simulation_noise import measured_noise
 from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.scene.scene import Scene
-from hw.base.config import read_json
-from hw.base.errors import InputError
-from hw.base.files import write_json
 from pipeline.stream.stream import StreamReader
 
 FORMAT_VERSION = 1
-
-
-def capture_figures(folder: Path, wavelengths: int) -> dict[str, int]:
-    """Images, views, spots, wavelengths and bytes of a capture."""
-    with StreamReader(folder) as stream:
-        plan = stream.plan
-        return {
-            "images": len(stream),
-            "views": plan.views,
-            "spots": len(plan.spots),
-            "wavelengths": wavelengths,
-            "bytes_raw": stream.bytes_raw(),
-            "bytes_stored": stream.bytes_stored,
-        }
 
 
 def make_summary(
@@ -44,35 +26,28 @@ def make_summary(
 ) -> dict[str, Any]:
     """The summary; `scores` as `disco_twin.evaluate.scores.score_run` wrote them, `calibration` as the pipeline did."""
     own = scores["reflectance"].get(method, {"measured": {}, "coverage": {}}) or {"measured": None, "coverage": None}
+    with StreamReader(folder.capture) as stream:
+        capture = {
+            "images": len(stream),
+            "views": stream.plan.views,
+            "spots": len(stream.plan.spots),
+            "wavelengths": len(scene.rig.lasers),
+            "bytes_raw": stream.bytes_raw(),
+            "bytes_stored": stream.bytes_stored,
+        }
     return {
         "format_version": FORMAT_VERSION,
         "scene": scene.name,
         "seed": scene.seed,
         "method": method,
         "stages": list(stages),
-        "capture": capture_figures(folder.capture, len(scene.rig.lasers)),
+        "capture": capture,
         "simulation_noise": measured_noise(scene, folder.twin / "responses"),
         "calibration": calibration,
         "relit": scores["relit"],
         "reflectance": {"log10_rmse_by_decade": own["measured"], "coverage_by_decade": own["coverage"]},
         "left_out": list(left_out),
     }
-
-
-def write_summary(summary: dict[str, Any], path: Path) -> None:
-    """Strict JSON: a NaN is refused here rather than by the next reader."""
-    write_json(path, summary)
-
-
-def load_summary(path: Path) -> dict[str, Any]:
-    """Read a summary of this format."""
-    data = read_json(path, dict[str, Any], "disco-twin score writes it anew")
-    if data.get("format_version") != FORMAT_VERSION:
-        raise InputError(
-            "another format", file=path, key="format_version", value=data.get("format_version"),
-            allowed=str(FORMAT_VERSION), remedy="disco-twin score writes it anew",
-        )  # fmt: skip
-    return data
 
 
 def rms(values: Sequence[float]) -> float:

@@ -7,18 +7,18 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+import trimesh
 
+from disco_twin.object.build import TwinObject, build_object, build_scan
+from hw.base.arrays import Bool
 from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.nominal_rig import CameraConfig
+from pipeline.plan.plan import Plan, make_plan
 
 if TYPE_CHECKING:
-    import trimesh
-
     from disco_twin.light.transport import Transport
-    from disco_twin.object.build import TwinObject
-    from disco_twin.scene.scene import Scene
-    from pipeline.plan.plan import Plan
+    from disco_twin.scene.scene import Scene  # its settings of the reconstruction are no part of what is simulated
 
 SUPERSAMPLE = 4  # rays per pixel and axis that decide which pixels show the object
 
@@ -32,22 +32,16 @@ class Experiment:
     @cached_property
     def object(self) -> TwinObject:
         """The object that light is traced through."""
-        from disco_twin.object.build import build_object
-
         return build_object(self.scene)
 
     @cached_property
     def scan(self) -> trimesh.Trimesh:
         """The mesh that the pipeline is given."""
-        from disco_twin.object.build import build_scan
-
         return build_scan(self.scene, self.object.mesh)
 
     @cached_property
     def plan(self) -> Plan:
         """Which images the capture consists of."""
-        from pipeline.plan.plan import make_plan
-
         return make_plan(self.scene.rig, self.scan)
 
     @cached_property
@@ -65,10 +59,8 @@ class Experiment:
         tree = np.random.SeedSequence([self.scene.seed, zlib.crc32(purpose.encode())])
         return int(tree.generate_state(1)[0])
 
-    def object_mask(self, view: CameraConfig) -> NDArray[np.bool_]:
+    def object_mask(self, view: CameraConfig) -> Bool:
         """(H, W) pixels of a held-out view that the object fills by at least a half."""
-        from pipeline.geometry.mesh import RayMesh
-
         camera = PinholeCamera.from_config(view)
         face = RayMesh.of(self.object.mesh).first_hit(*camera.rays(camera.pixel_centres(SUPERSAMPLE))).triangle
         fine = (face >= 0).reshape(camera.height, SUPERSAMPLE, camera.width, SUPERSAMPLE)

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.light.balance import EnergyBalance
 from disco_twin.light.truth import Truth, truth_columns
 from disco_twin.object.mesh import hat_basis
+from hw.base.arrays import I64
 from pipeline.plan.spots import farthest_points
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 COLUMNS_AT_ONCE = 4  # between two reports of the progress
 
 
-def true_reflectance(experiment: Experiment, columns: Sequence[int] | NDArray[np.int64], walks: int) -> Truth:
+def true_reflectance(experiment: Experiment, columns: Sequence[int] | I64, walks: int) -> Truth:
     """The true R_d from these scan vertices to all others, from `walks` photons a column. Needs the renderer."""
     basis = hat_basis(experiment.object.mesh, experiment.scan)
     return truth_columns(experiment.transport, basis, np.asarray(columns, np.int64), walks, experiment.seed("truth"))

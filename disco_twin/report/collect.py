@@ -8,24 +8,24 @@ from typing import Any
 
 import numpy as np
 
-from disco_twin.evaluate.scores import load_model, load_relit, load_scores
+from disco_twin.evaluate.scores import load_model, load_relit, load_scores, reference_halves
 from disco_twin.experiment.experiment import Experiment, mm_per_pixel
 from disco_twin.experiment.pipeline_process import load_results
-from disco_twin.experiment.references import reference_path
 from disco_twin.experiment.run_folder import RunFolder
+from disco_twin.light.truth import Truth
 from disco_twin.report.figures import Comparison, Impulse
 from disco_twin.report.page import ReportData
 from hw.record import Sensor
-from pipeline.calibrate.calibration import Calibration
+from pipeline.calibrate.calibration import Calibration, nominal_calibration
 from pipeline.geometry.nominal_rig import RigConfig
+from pipeline.plan.plan import ImageAddress
+from pipeline.stream.stream import CorruptImage, StreamReader
 
 SPOTS_SHOWN = 4
 
 
 def collect(experiment: Experiment, folder: RunFolder, summary: dict[str, Any]) -> ReportData:
     """Read what the report shows."""
-    from disco_twin.light.truth import Truth
-
     scene = experiment.scene
     methods = list(dict.fromkeys(row["method"] for row in summary["relit"]))
     truth = Truth.load(folder.twin / "truth.npz")
@@ -33,12 +33,8 @@ def collect(experiment: Experiment, folder: RunFolder, summary: dict[str, Any]) 
     distance = np.linalg.norm(points[truth.columns][:, None] - points[None], axis=2)
     sensor = Calibration.load(folder.work / "calibration.json").sensor
     shown, damaged = impulses(experiment.scene.rig, folder.capture, sensor)
-    models = {}
-    for method in methods:
-        if (columns := load_model(folder, method).reflectance_columns(truth.columns)) is not None:
-            models[method] = np.asarray(columns.mean, np.float64)
+    columns = {method: load_model(folder, method).reflectance_columns(truth.columns) for method in methods}
     made = load_results(folder)
-    launched = truth.balance.launched
     return ReportData(
         summary=summary,
         wavelengths_nm=[laser.wavelength_nm for laser in scene.rig.lasers],
@@ -47,11 +43,11 @@ def collect(experiment: Experiment, folder: RunFolder, summary: dict[str, Any]) 
         comparisons=comparisons(experiment, folder, methods, summary["relit"]),
         distance=distance,
         truth=truth.mean,
-        models=models,
+        models={m: np.asarray(own.mean, np.float64) for m, own in columns.items() if own is not None},
         decades={m: scores for m, scores in load_scores(folder)["reflectance"].items() if scores is not None},
         seconds={name: entry.seconds for name, entry in made.methods.items()},
         balance={
-            term: list(getattr(truth.balance, term) / launched)
+            term: list(getattr(truth.balance, term) / truth.balance.launched)
             for term in ("escaped", "absorbed", "reflected", "boundary", "inside")
         },
         imbalance=float(np.abs(truth.balance.residual).max()),
@@ -74,10 +70,6 @@ def impulses(rig: RigConfig, capture: Path, sensor: Sensor) -> tuple[list[list[I
 
     A spot with a damaged image is left out; the second list names that image.
     """
-    from pipeline.calibrate.calibration import nominal_calibration
-    from pipeline.plan.plan import ImageAddress
-    from pipeline.stream.stream import CorruptImage, StreamReader
-
     calibration = nominal_calibration(rig, sensor)
     laser = int(np.argmax([x.wavelength_nm for x in rig.lasers]))
     columns: list[list[Impulse]] = []
@@ -107,21 +99,18 @@ def comparisons(
     experiment: Experiment, folder: RunFolder, methods: Sequence[str], relit: Sequence[dict[str, Any]]
 ) -> list[Comparison]:
     """Relit images beside the reference (its subsurface layer, both halves together) for every light and view."""
-    from disco_twin.light.references import LAYERS, load_reference
-
     out = []
-    layer = LAYERS.index("subsurface")
+    masks = {view.name: experiment.object_mask(view) for view in experiment.scene.relight.views}
     for light in experiment.scene.relight.lights:
         for view in experiment.scene.relight.views:
-            reference = load_reference(reference_path(folder.twin / "references", light, view)).halves[:, layer]
             rows = [r for r in relit if r["light"] == light.name and r["view"] == view.name]
             out.append(
                 Comparison(
                     light.name,
                     view.name,
-                    reference.mean(axis=0),
+                    reference_halves(folder, light, view).mean(axis=0),
                     {m: load_relit(folder, m, light.name, view) for m in methods},
-                    experiment.object_mask(view),
+                    masks[view.name],
                     mm_per_pixel(view),
                     {r["method"]: r["nrmse"] for r in rows if r["nrmse"] is not None},
                 )

@@ -19,7 +19,7 @@ from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.run.progress import Report, run_log, stage_bar
 from disco_twin.scene.scene import Profile, Scene, load_scene
 from hw.base.errors import InputError, refused_by_the_disk
-from hw.base.files import write_atomically
+from hw.base.files import write_atomically, write_json
 from pipeline.capture.loop import Interrupted
 from pipeline.reconstruct.registry import known_methods, require_method
 from pipeline.records import StageFigures
@@ -207,7 +207,7 @@ def score_stages(run: Run) -> dict[str, Any]:
     Raises: InputError where a stage before is not finished, or the reconstruction is of other settings.
     """
     from disco_twin.evaluate.scores import load_scores, score_run
-    from disco_twin.evaluate.summary import make_summary, write_summary
+    from disco_twin.evaluate.summary import make_summary
     from disco_twin.report.collect import collect
     from disco_twin.report.page import write_report
 
@@ -227,7 +227,7 @@ def score_stages(run: Run) -> dict[str, Any]:
     left_out = [*left_out_by_the_twin(run.experiment), *made.left_out]
     stages, scores = stage_rows(run.folder, made.stages), load_scores(run.folder)
     summary = make_summary(run.scene, run.folder, run.methods[0], stages, scores, made.calibration, left_out)
-    write_summary(summary, run.folder.summary_file)
+    write_json(run.folder.summary_file, summary)
     write_report(collect(run.experiment, run.folder, summary), run.folder.report_file)
     return summary
 
