@@ -6,6 +6,7 @@ Emulated ports, simulated cameras and the sizes of real ones are handed in. A sc
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -31,6 +32,8 @@ from hw.serial.link import Link
 
 if TYPE_CHECKING:
     from hw.camera.genicam import GenicamCamera
+
+log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -72,9 +75,14 @@ class Connector:
             remedy = "name the device's port, or hand in what stands in for it"
             raise InputError("nothing emulates this device here", file=self.file.path, key=key, value=port,
                              remedy=remedy)  # fmt: skip
-        log = None if self.logs is None else ByteLog(self.logs / f"{name}.log")
+        record = None if self.logs is None else ByteLog(self.logs / f"{name}.log")
         with keys_named(self.file):
-            link = Link(url, baud, device, self.clock, log)
+            try:
+                link = Link(url, baud, device, self.clock, record)
+            except BaseException:
+                if record is not None:
+                    record.close()
+                raise
             try:
                 return driver(link)
             except BaseException:
@@ -176,8 +184,10 @@ class Connector:
                 attempt(self.board, boards)
                 for index in range(len(self.file.lasers)):
                     attempt(partial(self._dark, index), lasers)
-            for error in failed:
-                raise error
+            for error in failed[1:]:
+                log.error("%s", error)
+            if failed:
+                raise failed[0]
             for index, laser in enumerate(lasers):
                 self._require_settable(index, laser)
             return Drivers(lasers, boards[0], self.table(), self.clock)

@@ -193,11 +193,16 @@ def selftest(
 def _test_light(connect: Connector, board: Board, lasers: Mapping[str, int]) -> Iterator[DeviceFinding]:
     """Mirrors, gates and photodiodes of a dark rig; then each of these lasers (name -> index)."""
     file = connect.file
-    yield _try("mirrors", lambda: _test_mirrors(file, board))
-    yield _try("gates", lambda: _test_lines(file, board))
-    yield _try("photodiode, dark", lambda: _test_dark(file, board))
+    failed = []
+    for what, test in (("mirrors", _test_mirrors), ("gates", _test_lines), ("photodiode, dark", _test_dark)):
+        found = _try(what, partial(test, file, board))
+        failed += [] if found.good else [what]
+        yield found
     for name, index in lasers.items():
-        yield _try(name, partial(_test_laser, connect, board, index))
+        if failed:
+            yield DeviceFinding(name, False, f"not armed, since this failed: {', '.join(failed)}")
+        else:
+            yield _try(name, partial(_test_laser, connect, board, index))
 
 
 def _test_table(table: TurntableDriver) -> str:

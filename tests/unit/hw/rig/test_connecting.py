@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -72,6 +73,16 @@ def test_a_board_that_fails_leaves_no_laser_on(tmp_path: Path) -> None:
     with pytest.raises(DeviceError, match="mirror board"):
         connect.connect()
     assert not any(head.on_since for head in emulated.bench.heads)
+
+
+def test_every_failure_is_reported_and_no_log_stays_open(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Expected: the board's failure is raised, the laser's logged; an open file would be a warning, and so an error."""
+    path = tmp_path / "rig.toml"
+    path.write_text(rig_file_of(RIG, {"board": str(tmp_path / "none"), "laser1": str(tmp_path / "neither")}))
+    with pytest.raises(DeviceError, match=r"board\.port"):
+        Connector(load_rig_file(path), left_on().stand_ins(), tmp_path).connect()
+    assert "lasers[1].port" in caplog.text
+    gc.collect()
 
 
 def test_a_fault_that_nobody_foresaw_leaves_nothing_else_lit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

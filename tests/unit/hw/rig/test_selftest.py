@@ -14,6 +14,7 @@ from guard_fakes import guards_of
 from rig_fakes import emulation
 from rig_programs import GATE, Bench, devices, started
 
+from hw.base.errors import InputError
 from hw.devices.omicron import OmicronLaser
 from hw.rig.connect import Connector
 from hw.rig.rig_rules import load_rig_file
@@ -42,6 +43,21 @@ def test_the_gate_is_shut_before_a_laser_that_falls_silent_is_told_to_go_off(
     found = {f.name: f for f in selftest(load_rig_file(rig), None, armed=True)}["laser 635 nm"]
     assert not found.good and "did not answer ?LOf" in found.text
     assert lines == [0] and emulated.bench.board.lines == 0
+
+
+def test_no_laser_is_armed_on_a_rig_that_failed_in_the_dark(devices: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gate that does not follow may stand open. Expected: the laser behind it never emits."""
+    _, _, rig = devices
+    emitted: list[OmicronLaser] = []
+    monkeypatch.setattr(OmicronLaser, "emit", emitted.append)
+
+    def fails(*_: object) -> str:
+        raise InputError("line 0 does not follow")
+
+    monkeypatch.setattr("hw.rig.selftest._test_lines", fails)
+    found = {f.name: f for f in selftest(load_rig_file(rig), None, armed=True)}
+    assert not found["gates"].good and not emitted
+    assert not found["laser 635 nm"].good and "not armed, since this failed: gates" in found["laser 635 nm"].text
 
 
 def test_a_power_meter_is_looked_for_before_a_laser_emits(devices: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
