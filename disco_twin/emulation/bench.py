@@ -52,7 +52,7 @@ class Bench:
             sample=self._counts, on_move=partial(self._require_shut, "the mirrors"), on_lines=self._lines_changed
         )
         self.spindle = Spindle(on_move=self.turned)
-        self.cameras: list[Camera] = [BenchCamera(self, camera) for camera in twin.cameras]
+        self.cameras: list[Camera] = [BenchCamera(self, camera, camera.name) for camera in twin.cameras]
         self.hazards: list[str] = []
         nominal = twin.watts
         twin.watts = lambda laser, time_s: nominal(laser, time_s) * self._share(laser)
@@ -140,11 +140,7 @@ class BenchCamera:
 
     bench: Bench
     twin: Camera
-
-    @property
-    def name(self) -> str:
-        """The name in the configuration."""
-        return self.twin.name
+    name: str
 
     def expose(self) -> RawImage:
         """What the twin's camera sees of the bench."""

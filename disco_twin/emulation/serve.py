@@ -26,7 +26,7 @@ POLL_S, IDLE_S = 0.001, 0.02  # while an answer is on its way, and otherwise
 
 
 class PtyPort:
-    """A pseudo-terminal with a name of its own: a link in a folder. `fd` is what is read and written."""
+    """A pseudo-terminal with a name of its own: a link in a folder. `fd` is what is read and written, and watched."""
 
     def __init__(self, line: Cable, link: Path) -> None:
         self.line, self.link = line, link
@@ -35,12 +35,8 @@ class PtyPort:
         os.set_blocking(self.fd, False)
         link.unlink(missing_ok=True)
         link.symlink_to(os.ttyname(self._slave))
-        self.url = str(link)
+        self.url, self.source = str(link), self.fd
         line.opened()
-
-    def register(self, selector: selectors.BaseSelector) -> None:
-        """Watch it."""
-        selector.register(self.fd, selectors.EVENT_READ, self)
 
     def ready(self, fd: int, selector: selectors.BaseSelector) -> None:
         """Bytes from the user."""
@@ -55,22 +51,19 @@ class PtyPort:
 
 
 class TcpPort:
-    """A port of 127.0.0.1; one user at a time. `fd` is -1 while nobody is connected."""
+    """A port of 127.0.0.1; one user at a time. `source` is watched for users; `fd` is -1 while nobody is connected."""
 
     def __init__(self, line: Cable) -> None:
         self.line = line
         self._server = socket.create_server(("127.0.0.1", 0))
+        self.source = self._server.fileno()
         self._user: socket.socket | None = None
         self.fd = -1
         self.url = f"socket://127.0.0.1:{self._server.getsockname()[1]}"
 
-    def register(self, selector: selectors.BaseSelector) -> None:
-        """Watch it."""
-        selector.register(self._server, selectors.EVENT_READ, self)
-
     def ready(self, fd: int, selector: selectors.BaseSelector) -> None:
         """A user, or bytes from the user."""
-        if fd == self._server.fileno():
+        if fd == self.source:
             user, _ = self._server.accept()
             self._hang_up(selector)
             user.setblocking(False)
@@ -137,7 +130,7 @@ class Server:
             line = self._lines[name]
             line.plug()
             port = TcpPort(line) if self._folder is None else PtyPort(line, self._folder / name)
-            port.register(self._selector)
+            self._selector.register(port.source, selectors.EVENT_READ, port)
             self._ports[name] = port
 
     def unplug(self, name: str) -> None:

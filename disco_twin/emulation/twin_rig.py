@@ -70,10 +70,13 @@ class TwinRig(Rig):
         actual = actual_rig(config, seed) if actual is None else actual
         self.config, self.source, self.seed, self.actual = config, source, seed, actual
         self.watts: Callable[[int, float], float] = LaserPower(config.lasers, config.faults, seed).watts
-        self.lasers = [TwinLaser(self, i) for i in range(len(config.lasers))]
+        self.lasers = [TwinLaser(self, i, laser.wavelength_nm) for i, laser in enumerate(config.lasers)]
         self.projector = TwinProjector(self)
         self.turntable: Turntable = TwinTurntable(self)
-        self.cameras = [TwinCamera(self, i, Lars3.of(config, camera)) for i, camera in enumerate(actual.cameras)]
+        self.cameras = [
+            TwinCamera(self, i, nominal.name, Lars3.of(config, camera))
+            for i, (nominal, camera) in enumerate(zip(config.cameras, actual.cameras, strict=True))
+        ]
         self.photodiode = TwinPhotodiode(self)
         self.floodlight = TwinFloodlight(self)
         self.powered = False
@@ -147,11 +150,7 @@ class TwinLaser:
 
     rig: TwinRig
     index: int
-
-    @property
-    def wavelength_nm(self) -> float:
-        """Nominal wavelength."""
-        return self.rig.config.lasers[self.index].wavelength_nm
+    wavelength_nm: float
 
     def open_gate(self) -> None:
         """Let light out; refused while another gate is open. Raises: Refused."""
@@ -251,12 +250,8 @@ class TwinCamera:
 
     rig: TwinRig
     index: int
+    name: str
     optics: Lars3
-
-    @property
-    def name(self) -> str:
-        """The name in the configuration."""
-        return self.rig.config.cameras[self.index].name
 
     def expose(self) -> RawImage:
         """Discard a frame, take a frame."""

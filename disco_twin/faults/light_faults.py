@@ -17,10 +17,8 @@ from disco_twin.scene.rig_schema import FaultsConfig
 from pipeline.geometry.nominal_rig import LaserConfig
 
 RED_FROM_NM, GREEN_FROM_NM = 590.0, 500.0
-RED_WARM_UP = (
-    0.3,
-    20.0,
-)  # missing share at power-on, time constant in s: stable after about a minute (thesis fig. 4.6)
+# Missing share at power-on, time constant in s: stable after about a minute (thesis fig. 4.6).
+RED_WARM_UP = (0.3, 20.0)
 SOLID_STATE_WARM_UP = (0.7, 3.0)
 BLUE_NOISE_RMS, BLUE_NOISE_HZ, BLUE_NOISE_TONES = 0.03, (0.02, 7.0), 64
 MODE_HOP_S, MODE_HOP_STEP = 250.0, 0.06  # green jumps once, 250 s after power-on

@@ -40,9 +40,8 @@ def read_voxels(path: Path, lasers: int, key: str, highest: float = np.inf) -> V
         raise InputError(problem, file=path, key=key, remedy=remedy)
     for bad, what in ((~np.isfinite(values), "not a finite number"), (values < 0, "negative")):
         if bad.any():
-            raise InputError(
-                f"{_first(bad)} is {what} ({bad.sum()} in all)", file=path, key=key, allowed=">= 0", remedy=_CELL
-            )
+            problem = f"{_first(bad)} is {what} ({bad.sum()} in all)"
+            raise InputError(problem, file=path, key=key, allowed=">= 0", remedy=_CELL)
     if values.max() > highest:
         problem = f"{_first(values > highest)} is too large, the largest is {values.max():g}"
         raise InputError(problem, file=path, key=key, allowed=f"0 .. {highest:g}", remedy=_CELL)
@@ -66,9 +65,8 @@ def _read_npy(path: Path, key: str) -> Voxels:
         why = f" ({error.strerror})" if isinstance(error, OSError) and error.strerror else ""
         raise InputError(f"not a readable .npy file of numbers{why}", file=path, key=key, remedy=_NPY) from error
     if not isinstance(values, np.ndarray) or values.ndim not in (3, 4) or values.dtype.kind not in "fiu":
-        raise InputError(
-            "not an array of real numbers (nz, ny, nx) or (lasers, nz, ny, nx)", file=path, key=key, remedy=_NPY
-        )
+        problem = "not an array of real numbers (nz, ny, nx) or (lasers, nz, ny, nx)"
+        raise InputError(problem, file=path, key=key, remedy=_NPY)
     values = values.astype(np.float32)
     return Voxels(values if values.ndim == 4 else values[None], None, None)
 

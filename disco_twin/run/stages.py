@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -164,13 +165,8 @@ def capture_stages(run: Run) -> None:
     run.stage("scan", run.key("scan", views), lambda _: write_scan(experiment, folder.capture))
     if scene.rig.faults.deviation or scene.rig.sensor.response == "curved":  # else images of targets show nothing new
         run.stage("targets", run.key("targets"), lambda report: take_targets(scene, folder.capture, report), "images")
-    responses = folder.twin / "responses"
-    run.stage(
-        "capture",
-        run.key("capture"),
-        lambda report: take_images(experiment, folder.capture, responses, report),
-        "images",
-    )
+    take = partial(take_images, experiment, folder.capture, folder.twin / "responses")
+    run.stage("capture", run.key("capture"), take, "images")
 
 
 def truth_stages(run: Run) -> None:
@@ -183,12 +179,8 @@ def truth_stages(run: Run) -> None:
     drop_outdated(folder, "references", run.key("references"))
     keys = [reference_key(scene, light, view) for light in scene.relight.lights for view in scene.relight.views]
     shipped = shipped_references(run.scene_file, scene.name)
-    run.stage(
-        "references",
-        run.key("references", keys, scene.simulation.reference_walks),
-        lambda report: render_references(experiment, shipped, folder.twin / "references", report),
-        "lights",
-    )
+    render = partial(render_references, experiment, shipped, folder.twin / "references")
+    run.stage("references", run.key("references", keys, scene.simulation.reference_walks), render, "lights")
 
 
 def pipeline_stage(run: Run) -> None:

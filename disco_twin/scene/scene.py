@@ -77,9 +77,8 @@ class Scene(Strict):
             if len(set(names)) < len(names):
                 raise ValueError(f"{what}: names must be distinct, found {', '.join(names)}")
         if self.scan.vertices is not None and self.simulation.truth_columns > self.scan.vertices / 2:
-            raise ValueError(
-                f"simulation.truth_columns = {self.simulation.truth_columns}: more than half of scan.vertices"
-            )
+            columns = self.simulation.truth_columns
+            raise ValueError(f"simulation.truth_columns = {columns}: more than half of scan.vertices")
         return self
 
 

@@ -89,9 +89,8 @@ def _older(data: Mapping[str, NDArray[Any]]) -> int | None:
 def require_version(path: Path, found: Any, version: int, remedy: str) -> None:
     """Refuse a file of another format version. Raises: InputError."""
     if found != version:
-        raise InputError(
-            "another format", file=path, key="format_version", value=found, allowed=str(version), remedy=remedy
-        )
+        key, allowed = "format_version", str(version)
+        raise InputError("another format", file=path, key=key, value=found, allowed=allowed, remedy=remedy)
 
 
 def take_lock(handle: int) -> bool:

@@ -59,9 +59,8 @@ class ElliptecTable:
 
     def _ask(self, command: str, expected: str, parse: Callable[[str], T]) -> T:
         """The answer from its letters on."""
-        return self._dialogue.ask(
-            self._address + command, self._answers(expected), ANSWER_S, lambda line: parse(line[1:])
-        )
+        wanted = self._answers(expected)
+        return self._dialogue.ask(self._address + command, wanted, ANSWER_S, lambda line: parse(line[1:]))
 
     # ---- identity
 
@@ -69,9 +68,8 @@ class ElliptecTable:
         try:
             answer = self._ask("in", "IN", str)
         except NoAnswer as error:
-            raise self.link.wrong_device(
-                f"is not an Elliptec stage: asked {self._address}in, {self.link.heard()}"
-            ) from error
+            problem = f"is not an Elliptec stage: asked {self._address}in, {self.link.heard()}"
+            raise self.link.wrong_device(problem) from error
         try:
             kind, serial, travel, pulses = int(answer[2:4], 16), answer[4:12], int(answer[20:24], 16), answer[24:32]
             steps = int(pulses, 16)

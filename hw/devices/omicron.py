@@ -63,7 +63,7 @@ class OmicronLaser:
 
         Raises: WrongDevice; DeviceFault where the laser does not go off.
         """
-        self.link, self.framer, self._subscriber = link, OmicronFramer(), subscriber
+        self.link, self.name, self.framer, self._subscriber = link, link.device, OmicronFramer(), subscriber
         self._inbox: Inbox[str] = Inbox(link, self.framer)
         self._owed: set[str] = set()  # questions whose answer may still come
         self._silent = False  # it answered none of the questions that were to bring us back into step
@@ -72,11 +72,6 @@ class OmicronLaser:
         self.armed_mw = 0.0
         self.force_off()
         self.require_off()
-
-    @property
-    def name(self) -> str:
-        """What the rig calls this laser."""
-        return self.link.device
 
     # ---- talking
 
@@ -172,10 +167,6 @@ class OmicronLaser:
     def measured_mw(self) -> float:
         """Power by the laser's own photodiode, in mW."""
         return self._number("MDP")
-
-    def level(self) -> float:
-        """The stored set point as a share of the maximum power."""
-        return self._bits("GLP") / LEVELS
 
     def require_ready(self) -> None:
         """Refuse to go on with an open interlock, a turned key or any failure. Raises: DeviceFault."""
@@ -354,7 +345,7 @@ class OmicronLaser:
         So it is written on change only, and not again after a lost answer: the level itself shows whether it was.
         """
         for _ in range(ATTEMPTS):
-            if round(self.level() * LEVELS) == level:
+            if self._bits("GLP") == level:
                 return
             try:
                 answer = self._once("SLP", f"{level:03X}")
@@ -363,7 +354,7 @@ class OmicronLaser:
                 continue
             if answer.startswith("x"):
                 self._refuse(f"refused ?SLP{level:03X}")
-        if round(self.level() * LEVELS) != level:
+        if self._bits("GLP") != level:
             problem = f"did not keep level {level:03X} in {ATTEMPTS} attempts"
             raise self.link.error(DeviceRefused, problem, "reset the laser, or switch it off and on")
 

@@ -142,9 +142,8 @@ class ZaberTable:
         try:
             self.ask("")
         except NoAnswer as error:
-            raise self.link.wrong_device(
-                f"is not a Zaber stage: asked for its status, {self.link.heard()}", KEYS
-            ) from error
+            problem = f"is not a Zaber stage: asked for its status, {self.link.heard()}"
+            raise self.link.wrong_device(problem, KEYS) from error
         self._checked = self.ask("set comm.checksum 1").accepted
         if not self._checked:
             log.warning("%s: its firmware sends no checksums; a garbled digit may go unnoticed", self.link.device)

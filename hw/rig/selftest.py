@@ -166,7 +166,10 @@ def selftest(
     """Exercise every real device. Lasers emit, one behind an open gate at a time, only if `armed`."""
     connect = Connector(file, logs=logs)
     lasers = {laser.title: i for i, laser in enumerate(file.lasers) if laser.port != EMULATED}
-    off = [_try_on(f"{name}, off", partial(connect.omicron, i), _test_off) for name, i in lasers.items()]
+    off = [
+        _try_on(f"{name}, off", partial(connect.omicron, i), lambda laser: f"{laser.require_off():.2f} mW while off")
+        for name, i in lasers.items()
+    ]
     yield from off
     board = None
     if file.board.port != EMULATED:
@@ -247,10 +250,6 @@ def _test_dark(file: DevicesFile, board: Board) -> str:
         for laser in file.lasers
     ]
     return f"{', '.join(map(str, read))} counts"
-
-
-def _test_off(laser: OmicronLaser) -> str:
-    return f"{laser.require_off():.2f} mW while off"
 
 
 def _test_laser(connect: Connector, board: Board, index: int) -> str:

@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeVar
 
 from hw.base.clock import Elapsed, Timebase
 from hw.base.errors import InputError, Refused
@@ -23,6 +23,8 @@ from hw.rig.emission import begin_emission, check_lasers, require_light
 from hw.rig.rig_file import DevicesFile, GenicamDevice
 from hw.rig.verified_board import VerifiedBoard
 from hw.safety.signals import uninterrupted
+
+T = TypeVar("T")
 
 
 class SerialRig(Rig):
@@ -46,7 +48,7 @@ class SerialRig(Rig):
         self._drivers: Drivers | None = None
         self._board: VerifiedBoard | None = None
         self.last_open = -1  # the laser whose gate was opened last: whose photodiode is to be read
-        self.lasers = [GatedLaser(self, i) for i in range(len(self.file.lasers))]
+        self.lasers = [GatedLaser(self, i, laser.wavelength_nm) for i, laser in enumerate(self.file.lasers)]
         self.projector = Mirrors(self)
         self.turntable = SafeTurntable(self)
         self.cameras = list(cameras)
@@ -108,22 +110,12 @@ class SerialRig(Rig):
         return self._drivers is not None
 
     def drivers(self) -> Drivers:
-        """The drivers.
-
-        Raises: Refused outside `with rig:`.
-        """
-        if self._drivers is None:
-            raise Refused("the rig is switched off: use it inside `with rig:`")
-        return self._drivers
+        """The drivers. Raises: Refused outside `with rig:`."""
+        return _in_use(self._drivers)
 
     def board(self) -> VerifiedBoard:
-        """The board.
-
-        Raises: Refused outside `with rig:`.
-        """
-        if self._board is None:
-            raise Refused("the rig is switched off: use it inside `with rig:`")
-        return self._board
+        """The board. Raises: Refused outside `with rig:`."""
+        return _in_use(self._board)
 
     # ---- time
 
@@ -176,6 +168,12 @@ class SerialRig(Rig):
             raise Refused(f"the {what} must not move while the gate of laser {self.open_gate} is open")
 
 
+def _in_use(device: T | None) -> T:
+    if device is None:
+        raise Refused("the rig is switched off: use it inside `with rig:`")
+    return device
+
+
 # ---- its parts, as `hw.interface` names them
 
 
@@ -185,11 +183,7 @@ class GatedLaser:
 
     rig: SerialRig
     index: int
-
-    @property
-    def wavelength_nm(self) -> float:
-        """Nominal wavelength."""
-        return self.rig.file.lasers[self.index].wavelength_nm
+    wavelength_nm: float
 
     def open_gate(self) -> None:
         """Let light out; refused while another gate is open. Raises: Refused, DeviceError."""

@@ -117,9 +117,8 @@ def _read_table(path: Path, described: CaptureDescription) -> dict[Key, list[Fra
                 key, frame = _row(path, rows.line_num, row, described)
                 brackets.setdefault(key, []).append(frame)
     except OSError as error:
-        raise InputError(
-            f"cannot be read ({error.strerror})", file=path, remedy="docs/lab.md has an example"
-        ) from error
+        problem, remedy = f"cannot be read ({error.strerror})", "docs/lab.md has an example"
+        raise InputError(problem, file=path, remedy=remedy) from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"is not a table ({error})", file=path, remedy="save it as CSV in UTF-8") from error
     for frames in brackets.values():
@@ -183,9 +182,7 @@ def _row(path: Path, line: int, row: dict[str, str], described: CaptureDescripti
 
 def _nearest(value: float, choices: tuple[float, ...] | list[float], tolerance: float, period: float) -> int | None:
     """The choice that is meant."""
-    away = [
-        abs(math.remainder(value - choice, period)) if period < math.inf else abs(value - choice) for choice in choices
-    ]
+    away = [abs(math.remainder(value - choice, period)) for choice in choices]
     best = min(range(len(choices)), key=away.__getitem__)
     return best if away[best] <= tolerance else None
 
@@ -257,9 +254,7 @@ def read_frame(path: Path, shape: tuple[int, int], full_scale_dn: int, where: st
         problem = f"has {pixels.shape[1]} x {pixels.shape[0]} pixels"
         raise InputError(problem, file=path, allowed=f"the camera's {shape[1]} x {shape[0]}")
     if pixels.min() < 0 or pixels.max() > full_scale_dn:
-        value = int(pixels.max() if pixels.max() > full_scale_dn else pixels.min())
+        value, allowed = int(pixels.max() if pixels.max() > full_scale_dn else pixels.min()), f"0 to {full_scale_dn}"
         remedy = "correct sensor.bits, or shift the values down if the camera fills the upper bits"
-        raise InputError(
-            "holds values beyond the sensor's", file=path, value=value, allowed=f"0 to {full_scale_dn}", remedy=remedy
-        )
+        raise InputError("holds values beyond the sensor's", file=path, value=value, allowed=allowed, remedy=remedy)
     return pixels.astype(np.uint16)

@@ -7,12 +7,11 @@ turntable and projector, so that a capture that was interrupted ends with the ve
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 from hw.base.errors import DiscoError, InputError
-from hw.interface import Floodlight, Rig, gate_open
+from hw.interface import Rig, gate_open
 from hw.record import RawImage, Sensor
 from hw.safety.signals import interruptible, raise_if_interrupted, uninterrupted
 from pipeline.capture.laser_log import DRIFT_SHARE, append_lasers, drifts, read_lasers
@@ -125,8 +124,11 @@ def _take(rig: Rig, plan: Plan, address: ImageAddress) -> tuple[RawImage, ImageM
     camera = rig.cameras[plan.camera_of(address.view)]
     angle = plan.angles_rad[plan.angle_of(address.view)]
     if address.kind == "silhouette":
-        with _lit(rig.floodlight):
+        try:
+            rig.floodlight.on()
             raw = camera.expose()
+        finally:
+            rig.floodlight.off()
         return raw, ImageMeta(rig.now(), 0.0, angle, -1, -1)
     aim = plan.spots[address.spot]
     if address.laser == 0:
@@ -135,15 +137,6 @@ def _take(rig: Rig, plan: Plan, address: ImageAddress) -> tuple[RawImage, ImageM
         raw = camera.expose()
         power = rig.photodiode.read()
     return raw, ImageMeta(rig.now(), power, angle, aim.u, aim.v)
-
-
-@contextmanager
-def _lit(floodlight: Floodlight) -> Iterator[None]:
-    try:
-        floodlight.on()
-        yield
-    finally:
-        floodlight.off()
 
 
 def _interrupted(stream: StreamWriter) -> Interrupted:

@@ -73,13 +73,8 @@ def require_same(rig: DevicesFile, begun_with: DevicesFile, path: Path) -> None:
     for key in [*then, *(key for key in now if key not in then)]:
         if not _same(key, now, then):
             was = f"was begun with {_words(then.get(key))}" if key in then else "was begun without it"
-            raise InputError(
-                f"the capture in this folder {was}",
-                file=path,
-                key=key,
-                value=now.get(key, "nothing"),
-                remedy="set it back, or choose another --out",
-            )
+            problem, remedy = f"the capture in this folder {was}", "set it back, or choose another --out"
+            raise InputError(problem, file=path, key=key, value=now.get(key, "nothing"), remedy=remedy)
 
 
 def _same(key: str, now: Mapping[str, Any], then: Mapping[str, Any]) -> bool:
