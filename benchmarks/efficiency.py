@@ -202,7 +202,7 @@ def objects(quick: bool) -> Iterator[tuple[str, Any, Any, list[int]]]:
     import trimesh
     from scipy import sparse
 
-    from disco_twin.object.build import Boundary, Medium, TwinObject, build_object, build_scan, hat_basis
+    from disco_twin.object.build import Medium, TwinBoundary, TwinObject, build_object, build_scan, hat_basis
     from disco_twin.scene.scene import load_scene
 
     scene = load_scene(SCENE, faults=False)
@@ -224,7 +224,7 @@ def objects(quick: bool) -> Iterator[tuple[str, Any, Any, list[int]]]:
     )
     yield (
         "dark_vein",
-        TwinObject(ball, Boundary("rough", 1.3, 0.3), medium),
+        TwinObject(ball, TwinBoundary("rough", 1.3, 0.3), medium),
         sparse.eye_array(len(ball.vertices)).tocsr(),
         list(facing),
     )

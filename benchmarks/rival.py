@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import Delaunay
 
-from disco_twin.object.build import Boundary, Medium, TwinObject
+from disco_twin.object.build import Medium, TwinBoundary, TwinObject
 
 RADIUS, VOXELS, ALBEDO, ETA, LEVELS = 20.0, 32, 0.995, 1.3, 64
 ROULETTE, SURVIVORS = 0.1, 2  # below this weight one of so many survives, in the walk and in pmmc
@@ -36,7 +36,7 @@ def ball(kind: str = "rough") -> TwinObject:
     mesh = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS)
     sigma_t = 2.0 * np.random.default_rng(0).uniform(0.75, 1.25, (1, VOXELS, VOXELS, VOXELS)).astype(np.float32)
     medium = Medium(sigma_t, np.full_like(sigma_t, ALBEDO), np.full(3, -RADIUS), np.full(3, RADIUS), (0.0,))
-    boundary = Boundary("rough", ETA, 0.3) if kind == "rough" else Boundary("smooth", ETA, 0.0)
+    boundary = TwinBoundary("rough", ETA, 0.3) if kind == "rough" else TwinBoundary("smooth", ETA, 0.0)
     return TwinObject(mesh, boundary, medium)
 
 

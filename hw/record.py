@@ -10,9 +10,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from hw.base.arrays import F32, F64, U8, U16, Bool
 
 
 @dataclass(frozen=True)
@@ -23,8 +22,8 @@ class RawImage:
     charge:   (height, width) uint16, digitised charge in counts (DN)
     """
 
-    exponent: NDArray[np.uint8]
-    charge: NDArray[np.uint16]
+    exponent: U8
+    charge: U16
 
 
 @dataclass(frozen=True)
@@ -62,9 +61,9 @@ class RadianceImage:
     The radiance of a saturated pixel is a lower bound and its variance means nothing.
     """
 
-    radiance: NDArray[np.float32]
-    variance: NDArray[np.float32]
-    saturated: NDArray[np.bool_]
+    radiance: F32
+    variance: F32
+    saturated: Bool
 
 
 def to_radiance(raw: RawImage, sensor: Sensor, laser: int) -> RadianceImage:
@@ -103,7 +102,7 @@ def _electrons(charge: F64, sensor: Sensor) -> tuple[F64, F64 | float]:
     return linear(charge) * well, (linear(charge + 0.5) - linear(charge - 0.5)) * well
 
 
-def _decision_bias(electrons: F64, exponent: NDArray[np.uint8], sensor: Sensor) -> F64:
+def _decision_bias(electrons: F64, exponent: U8, sensor: Sensor) -> F64:
     """Electrons by which the charge of a pixel that was let to integrate on is too high on average.
 
     A pixel goes on when it found at most c = `decision_e` electrons, so near the decision the unlucky ones go on and

@@ -8,9 +8,8 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from hw.base.arrays import F32
 from pipeline.geometry.camera import PinholeCamera
-
-F32 = NDArray[np.float32]
 
 GLARE_SHARE = 0.005  # of the light; thesis 4.3 asks for a high quality lens, whose veiling glare is below a percent
 

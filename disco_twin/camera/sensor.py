@@ -12,9 +12,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from hw.base.arrays import F64
 from hw.record import RawImage, Sensor
-
-F64 = NDArray[np.float64]
 
 GAMMA, FOOT = 2.2, 0.02  # of a camera whose response is "curved"
 

@@ -12,17 +12,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from disco_twin.faults.actual_rig import ActualRig, nudge
 from disco_twin.faults.light_faults import Stream, generator
+from hw.base.arrays import F32, F64
 from hw.interface import Aim
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.plan.targets import Targets
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
 
 HAND_MM, HAND_DEG = 2.0, 2.0  # standard deviations per axis
 FLOODLIGHT = 2e-5  # W/(mm^2 sr) of a white surface

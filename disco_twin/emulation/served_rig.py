@@ -6,20 +6,16 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from disco_twin.emulation.emulated_rig import Emulation
 from disco_twin.emulation.rig_file_of import rig_file_of
 from disco_twin.emulation.serve import Server
 from disco_twin.emulation.twin_rig import TwinRig, watts_per_count
 from disco_twin.scene.rig_schema import TwinRigConfig
+from hw.base.arrays import F32
 from hw.base.clock import WallClock
 from hw.base.errors import DiscoError, InputError
 from hw.base.files import alone_in, require_folder, write_atomically
 from hw.interface import Aim
-
-F32 = NDArray[np.float32]
 
 
 class Darkness:

@@ -11,19 +11,17 @@ from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from disco_twin.camera.lars3 import Lars3
 from disco_twin.faults.actual_rig import ActualRig, actual_rig
 from disco_twin.faults.light_faults import LaserPower, Stream, generator, speckle
 from disco_twin.scene.rig_schema import TwinRigConfig
+from hw.base.arrays import F32
 from hw.base.errors import DiscoError, InputError, Refused
 from hw.devices.mm_ard import ADC_TOP
 from hw.interface import Aim, LaserReading, Rig, Turntable
 from hw.record import RawImage
 from pipeline.geometry.nominal_rig import LaserConfig
-
-F32 = NDArray[np.float32]
 
 FRAMES_PER_IMAGE = 2  # every other frame is discarded while the mirrors move (thesis 4.1)
 TURN_S = 8.0  # turning to another angle and coming to rest

@@ -10,16 +10,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from disco_twin.faults.light_faults import Stream, generator
 from disco_twin.scene.rig_schema import TwinRigConfig
+from hw.base.arrays import F64
 from hw.interface import Aim
 from pipeline.geometry.camera import PinholeCamera, turn
 from pipeline.geometry.projector import TwoMirrorProjector
-
-F64 = NDArray[np.float64]
 
 # Standard deviations.
 CAMERA_MM, CAMERA_DEG = 1.0, 0.2

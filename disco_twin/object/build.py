@@ -18,11 +18,11 @@ from pipeline.geometry.surface_from_points import reconstruct_surface
 if TYPE_CHECKING:
     from disco_twin.scene.scene import Scene
 
-__all__ = ["Boundary", "Medium", "TwinObject", "build_object", "build_scan", "hat_basis"]
+__all__ = ["Medium", "TwinBoundary", "TwinObject", "build_object", "build_scan", "hat_basis"]
 
 
 @dataclass(frozen=True)
-class Boundary:
+class TwinBoundary:
     """Rough (GGX, `alpha`) or smooth dielectric of relative index `eta`; matched: no boundary, eta = 1.
 
     Smooth is for what is known exactly of energy: its images are black, which no scene may ask for.
@@ -38,7 +38,7 @@ class TwinObject:
     """A closed mesh (object frame, mm), its boundary and the medium inside."""
 
     mesh: trimesh.Trimesh
-    boundary: Boundary
+    boundary: TwinBoundary
     medium: Medium
 
 
@@ -46,7 +46,7 @@ def build_object(scene: Scene) -> TwinObject:
     """The object of a scene. Raises: InputError for a mesh or a medium that cannot be traced."""
     mesh, surface = _mesh(scene.object.shape), scene.object.boundary
     rough = surface.kind == "rough"
-    boundary = Boundary("rough", surface.eta, surface.alpha) if rough else Boundary("matched", 1.0, 0.0)
+    boundary = TwinBoundary("rough", surface.eta, surface.alpha) if rough else TwinBoundary("matched", 1.0, 0.0)
     wavelengths = [laser.wavelength_nm for laser in scene.rig.lasers]
     return TwinObject(mesh, boundary, build_medium(scene.object.medium, mesh, wavelengths))
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from disco_twin.object.mesh import closest, depth
 from disco_twin.scene.object_schema import Crack, Feature, HollowCore, Layers, Patch, Veins
+from hw.base.arrays import F64, I64
 from hw.base.errors import InputError
 
-F64 = NDArray[np.float64]
 MOST_VEINS = 1e6
 
 
@@ -61,7 +61,7 @@ def _foam(feature: Veins, points: F64, mesh: trimesh.Trimesh) -> F64:
         raise InputError(problem, key=key, value=feature.spacing_mm, allowed=most, remedy="a larger spacing_mm")
     sites = random.uniform(low, high, size=(int(count), 3))
     warped = points + 0.2 * feature.spacing_mm * _waves(points, feature.spacing_mm, random)
-    index: NDArray[np.int64] = np.asarray(cKDTree(sites).query(warped, k=2)[1])
+    index: I64 = np.asarray(cKDTree(sites).query(warped, k=2)[1])
     nearest, other = sites[index[:, 0]], sites[index[:, 1]]
     across = other - nearest
     distance = np.sum(((nearest + other) / 2 - warped) * across, axis=1) / np.linalg.norm(across, axis=1)

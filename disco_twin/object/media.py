@@ -17,9 +17,9 @@ from disco_twin.object.features import coverage
 from disco_twin.object.voxels import read_voxels
 from disco_twin.scene.materials import measured
 from disco_twin.scene.object_schema import Grid, HollowCore, Homogeneous, MediumConfig
+from hw.base.arrays import F32, F64
 from hw.base.errors import InputError
 
-F64 = NDArray[np.float64]
 KEY = "object.medium"
 MOST_CELLS = 30_000_000  # 360 MB a wavelength while the medium is built
 
@@ -32,8 +32,8 @@ class Medium:
     low, high: (3,) x, y, z corners of the grid in mm, object frame; g: L asymmetries (Henyey-Greenstein)
     """
 
-    sigma_t: NDArray[np.float32]
-    albedo: NDArray[np.float32]
+    sigma_t: F32
+    albedo: F32
     low: F64
     high: F64
     g: tuple[float, ...]

@@ -11,9 +11,9 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
+from hw.base.arrays import F64, I64
 from hw.base.errors import InputError
 
-F64 = NDArray[np.float64]
 KEY = "object.shape.file"
 
 LARGEST_MM, SMALLEST_MM = 2000.0, 1.0  # extents that a rig of about 500 mm working distance can mean
@@ -139,7 +139,7 @@ _EXPORT = "export the mesh again as a binary PLY, closed and in mm"
 _FLIP = "recompute its normals outside"
 
 
-def closest(mesh: trimesh.Trimesh, points: F64) -> tuple[F64, NDArray[np.int64]]:
+def closest(mesh: trimesh.Trimesh, points: F64) -> tuple[F64, I64]:
     """(N, 3) closest points on the surface to (N, 3) points, and (N,) the triangles that they lie on."""
     v, f = _arrays(mesh)
     _, triangle, weights = gpytoolbox.squared_distance(points, v, f, use_cpp=True)

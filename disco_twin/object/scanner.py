@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
 from disco_twin.faults.light_faults import Stream, generator
-
-F64 = NDArray[np.float64]
+from hw.base.arrays import F64
 
 POINTS = 40_000
 NOISE_MM, COAT_MM = 0.05, 0.02  # of single points; thickness of the spray

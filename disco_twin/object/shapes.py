@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
 from disco_twin.scene.object_schema import Box, Pebble, Sphere, Torus
+from hw.base.arrays import F64, I64
 
-F64 = NDArray[np.float64]
 SUBDIVISIONS = 5  # of an icosahedron: 10242 vertices, 20480 triangles
 DENTS = np.array([[0.55, -0.75, 0.35], [-0.6, 0.5, 0.62]])  # directions of the pebble's two concave dents
 
@@ -53,8 +52,8 @@ def box(config: Box, triangles: int = 20_000) -> trimesh.Trimesh:
     size = np.array(config.size_mm)
     area = 2 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
     cells = np.maximum(1, np.round(size / np.sqrt(2 * area / triangles))).astype(int)
-    points: list[NDArray[np.int64]] = []
-    faces: list[NDArray[np.int64]] = []
+    points: list[I64] = []
+    faces: list[I64] = []
     for axis in range(3):
         a, b = (axis + 1) % 3, (axis + 2) % 3
         for side in (0, 1):

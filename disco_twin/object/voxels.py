@@ -7,18 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hw.base.arrays import F32, F64, Bool
 from hw.base.errors import InputError
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Voxels:
     """values: (C, nz, ny, nx) float32, C = 1 or one channel a laser; low, high: (3,) x, y, z corners or None."""
 
-    values: NDArray[np.float32]
+    values: F32
     low: F64 | None
     high: F64 | None
 
@@ -53,7 +51,7 @@ _CELL = "mend these voxels, or fill them with their neighbours' mean"
 _VOL = "write it again, or give an .npy file with low_mm and high_mm"
 
 
-def _first(bad: NDArray[np.bool_]) -> str:
+def _first(bad: Bool) -> str:
     channel, z, y, x = (int(i) for i in np.argwhere(bad)[0])
     return f"voxel z={z} y={y} x={x} of channel {channel}"
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from hw.base.arrays import F64
+
 CHANNELS_NM = (635.0, 532.0, 476.0)  # which laser stands for the table's red, green and blue
 
 # name: (sigma_s' for R, G, B, sigma_a for R, G, B) in 1/mm

@@ -15,12 +15,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hw.base.arrays import U16
 from hw.base.errors import InputError
 from hw.record import RawImage
-
-U16 = NDArray[np.uint16]
 
 
 @dataclass(frozen=True)

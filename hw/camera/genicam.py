@@ -11,15 +11,14 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hw.base.arrays import U16
 from hw.base.errors import DiscoError, InputError
 from hw.camera.bracket import Bracket
 from hw.record import RawImage
 
 log = logging.getLogger(__name__)
 
-U16 = NDArray[np.uint16]
 
 ATTEMPTS = 4  # frames that may be lost in a row before the camera is given up
 SLACK_S = 1.0  # a frame that has not arrived this long after its exposure is lost

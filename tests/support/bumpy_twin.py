@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from disco_twin.object.build import Boundary, Medium, TwinObject
+from disco_twin.object.build import Medium, TwinBoundary, TwinObject
 
 F64 = NDArray[np.float64]
 
@@ -20,7 +20,7 @@ def bumpy(kind: str = "rough", alpha: float = 0.3, g: float = 0.4) -> TwinObject
     random = np.random.default_rng(1)
     sigma_t = random.uniform(0.6, 3.0, (1, 5, 5, 5)).astype(np.float32)
     albedo = random.uniform(0.9, 1.0, sigma_t.shape).astype(np.float32)
-    boundary = Boundary(kind, 1.0 if kind == "matched" else 1.3, alpha if kind == "rough" else 0.0)  # type: ignore[arg-type]
+    boundary = TwinBoundary(kind, 1.0 if kind == "matched" else 1.3, alpha if kind == "rough" else 0.0)  # type: ignore[arg-type]
     return TwinObject(mesh, boundary, Medium(sigma_t, albedo, low - 0.1, high + 0.1, (g,)))
 
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from disco_twin.light.sources import BeamSource
 from disco_twin.light.transport import Traced, Transport
-from disco_twin.object.build import Boundary, Medium, TwinObject
+from disco_twin.object.build import Medium, TwinBoundary, TwinObject
 from pipeline.geometry.camera import PinholeCamera, look_at
 
 F64 = NDArray[np.float64]
@@ -29,7 +29,7 @@ def twin(
     mesh: trimesh.Trimesh, kind: Kind, eta: float, sigma_t: float, albedo: ArrayLike, g: float = 0.0, alpha: float = 0.3
 ) -> TwinObject:
     """A homogeneous object."""
-    boundary = Boundary(kind, 1.0 if kind == "matched" else eta, alpha if kind == "rough" else 0.0)
+    boundary = TwinBoundary(kind, 1.0 if kind == "matched" else eta, alpha if kind == "rough" else 0.0)
     return TwinObject(mesh, boundary, homogeneous(mesh, sigma_t, albedo, g))
 
 

@@ -16,7 +16,7 @@ from twins import beam, block, camera, escaped, twin
 from disco_twin.light import walk
 from disco_twin.light.sources import HatSource, light_source
 from disco_twin.light.transport import EnergyBalance, Transport
-from disco_twin.object.build import Boundary, Medium, TwinObject
+from disco_twin.object.build import Medium, TwinBoundary, TwinObject
 from pipeline.relight.lights import Uniform
 
 F64 = NDArray[np.float64]
@@ -49,7 +49,7 @@ def test_balance(kind: str) -> None:
     object) within the quanta's rounding; a smooth or matched boundary loses nothing.
     """
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=4.0)
-    boundary = Boundary(kind, 1.0 if kind == "matched" else 1.4, 0.3 if kind == "rough" else 0.0)  # type: ignore[arg-type]
+    boundary = TwinBoundary(kind, 1.0 if kind == "matched" else 1.4, 0.3 if kind == "rough" else 0.0)  # type: ignore[arg-type]
     transport = Transport(TwinObject(mesh, boundary, veined_medium(mesh)), cells=64)
 
     def light(group: object) -> object:
@@ -219,7 +219,7 @@ def test_equilibrium_in_even_light(shape: str, kind: str) -> None:
     low, high = np.asarray(mesh.bounds, float)
     sigma_t = np.random.default_rng(3).uniform(0.2, 2.0, (1, 4, 4, 4)).astype(np.float32)
     medium = Medium(sigma_t, np.ones_like(sigma_t), low - 0.1, high + 0.1, (0.5,))
-    transport = Transport(TwinObject(mesh, Boundary(kind, eta, 0.0), medium))  # type: ignore[arg-type]
+    transport = Transport(TwinObject(mesh, TwinBoundary(kind, eta, 0.0), medium))  # type: ignore[arg-type]
     light = Uniform(radiance=1.0)
     traced = transport.trace(
         lambda group: light_source(light, transport.radius, group), REPLICATES, 20_000, seed=41, deposit=True

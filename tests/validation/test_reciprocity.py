@@ -12,7 +12,7 @@ from twins import twin
 
 from disco_twin.light.transport import Transport
 from disco_twin.light.truth import REPLICATES, truth_columns
-from disco_twin.object.build import Boundary, Medium, TwinObject, hat_basis
+from disco_twin.object.build import Medium, TwinBoundary, TwinObject, hat_basis
 from pipeline.geometry.fresnel import mean_transmittance
 
 F64 = NDArray[np.float64]
@@ -32,7 +32,7 @@ def two_halves(kind: str) -> tuple[trimesh.Trimesh, TwinObject]:
     albedo[..., 3:] = 0.85
     low, high = np.asarray(fine.bounds, float)
     eta = 1.0 if kind == "matched" else 1.4
-    boundary = Boundary(kind, eta, 0.3 if kind == "rough" else 0.0)  # type: ignore[arg-type]
+    boundary = TwinBoundary(kind, eta, 0.3 if kind == "rough" else 0.0)  # type: ignore[arg-type]
     return scan, TwinObject(fine, boundary, Medium(sigma_t, albedo, low, high, (0.6,)))
 
 

@@ -25,7 +25,7 @@ from disco_twin.light.importance import Splitting
 from disco_twin.light.sampling import Rng
 from disco_twin.light.sources import BeamSource
 from disco_twin.light.transport import Traced, Transport
-from disco_twin.object.build import Boundary, Medium, TwinObject
+from disco_twin.object.build import Medium, TwinBoundary, TwinObject
 
 WALKS = 3000
 SPOTS = 5
@@ -44,7 +44,7 @@ def pebble(kind: str) -> Transport:
     low, high = np.asarray(mesh.bounds, float)
     medium = Medium(sigma_t, random.uniform(0.9, 1.0, shape).astype(np.float32), low - 0.1, high + 0.1, (0.3,) * 3)
     eta = 1.0 if kind == "matched" else 1.3
-    return Transport(TwinObject(mesh, Boundary(kind, eta, 0.3 if kind == "rough" else 0.0), medium), cells=64)  # type: ignore[arg-type]
+    return Transport(TwinObject(mesh, TwinBoundary(kind, eta, 0.3 if kind == "rough" else 0.0), medium), cells=64)  # type: ignore[arg-type]
 
 
 def spots(which: Sequence[int]) -> Any:

@@ -19,7 +19,7 @@ from significance import assert_z, z_of_difference
 from benchmarks.volpath import volpath_scene
 from disco_twin.light.references import render_reference
 from disco_twin.light.transport import Transport
-from disco_twin.object.build import Boundary, Medium, TwinObject, build_object
+from disco_twin.object.build import Medium, TwinBoundary, TwinObject, build_object
 from disco_twin.scene.scene import load_scene
 from pipeline.geometry.camera import PinholeCamera, look_at
 from pipeline.relight.lights import Directional, Uniform
@@ -27,7 +27,7 @@ from pipeline.relight.lights import Directional, Uniform
 BLOCK, PIXELS = 4, 24
 
 
-def bumpy(boundary: Boundary, heterogeneous: bool) -> TwinObject:
+def bumpy(boundary: TwinBoundary, heterogeneous: bool) -> TwinObject:
     """A dented ball of about 10 mm, some four to twelve free paths across; the albedo is constant, so that Mitsuba's
     interpolation (of sigma_t and albedo) and ours (of sigma_t and sigma_s) mean the same medium.
     """
@@ -65,14 +65,14 @@ def blocks(images: np.ndarray) -> np.ndarray:
 
 
 CASES = [
-    pytest.param(Boundary("rough", 1.3, 0.3), False, "uniform", id="rough-homogeneous-uniform"),
-    pytest.param(Boundary("rough", 1.5, 0.4), True, "directional", id="rough-heterogeneous-directional"),
-    pytest.param(Boundary("matched", 1.0, 0.0), True, "directional", id="matched-heterogeneous-directional"),
+    pytest.param(TwinBoundary("rough", 1.3, 0.3), False, "uniform", id="rough-homogeneous-uniform"),
+    pytest.param(TwinBoundary("rough", 1.5, 0.4), True, "directional", id="rough-heterogeneous-directional"),
+    pytest.param(TwinBoundary("matched", 1.0, 0.0), True, "directional", id="matched-heterogeneous-directional"),
 ]
 
 
 @pytest.mark.parametrize(("boundary", "heterogeneous", "kind"), CASES)
-def test_agrees_with_stock_volpath(boundary: Boundary, heterogeneous: bool, kind: str, tmp_path: Path) -> None:
+def test_agrees_with_stock_volpath(boundary: TwinBoundary, heterogeneous: bool, kind: str, tmp_path: Path) -> None:
     """Expected: the same radiance in every 4 x 4 block, surface reflection included, within both sides' noise; so too
     the light from below the surface alone, which is volpath's image less that of the same object, black inside.
     """
