@@ -32,7 +32,7 @@ from hw.record import to_radiance
 from pipeline.calibrate import pose as pose_module
 from pipeline.calibrate.intrinsics import find_corners, fit_intrinsics
 from pipeline.calibrate.outline import mesh_mask, object_mask
-from pipeline.calibrate.projector_fit import projection, refine
+from pipeline.calibrate.projector_fit import refine, true_spots
 from pipeline.calibrate.response import TABLE, fit_response
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.nominal_rig import CameraConfig, ProjectorConfig
@@ -207,7 +207,7 @@ def projectors(
         seen[::5] += 8 * rng.standard_normal(seen[::5].shape)
 
         def fit(seen: F64 = seen, steps: F64 = steps, normal: F64 = normal, way: F64 = way) -> TwoMirrorProjector:
-            true = projection(seen, steps, 40.0, np.random.default_rng(0)).inliers
+            true = true_spots(seen, steps, 40.0, np.random.default_rng(0))
             return refine(nominal, seen[true], steps[true], normal[true], -way[true]).projector
 
         found, took = timed(fit, repetitions)

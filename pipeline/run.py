@@ -19,11 +19,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
-from pydantic import Field
 
 from hw.base.config import Strict, read_json
 from hw.base.errors import DiscoError, InputError, refused_by_the_disk
@@ -36,8 +35,8 @@ from pipeline.calibrate.figures import figures
 from pipeline.calibrate.target_images import has_targets
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import Boundary
+from pipeline.geometry.mesh import read_scan
 from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
-from pipeline.geometry.scan import read_scan
 from pipeline.model.relightable import RelightableModel
 from pipeline.plan.targets import FOLDER
 from pipeline.reconstruct.methods import reconstruct
@@ -70,7 +69,7 @@ class Request(Strict):
 
     format_version: Literal[1]
     reconstruct: ReconstructConfig = ReconstructConfig()
-    relight: Annotated[RelightRequest, Field()] = RelightRequest()
+    relight: RelightRequest = RelightRequest()
 
 
 @dataclass
@@ -162,7 +161,7 @@ def run(capture: Path, work: Path, request: Request, given: Path | None = None) 
         },
         "capture": asdict(statistics),
         "calibration": calibrated,
-        "left_out": [item.row() for item in left_out],
+        "left_out": left_out,
         "warnings": [
             *warnings_of(statistics),
             *(

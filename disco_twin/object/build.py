@@ -67,7 +67,7 @@ def build_scan(scene: Scene, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
             raise InputError(problem, key="scan.vertices", allowed=allowed, remedy=remedy)
         return mesh
     if scene.rig.faults.scanner:
-        return reconstruct_surface(*scan_points(mesh, scene.seed), vertices).mesh
+        return reconstruct_surface(*scan_points(mesh, scene.seed), vertices)
     if isinstance(shape, Box):
         return shapes.box(shape, triangles=2 * vertices)  # keeps the edges sharp
     return remesh(mesh, vertices)

@@ -21,7 +21,6 @@ STYLE = Path(__file__).with_name("templates") / "figures.mplstyle"
 
 INK, FAINT, TRUTH = "#22272e", "#c9cdd3", "#22272e"
 SPARE = ("#8a5a9e", "#b5534f", "#3d8f8f", "#7a6f3a")
-LASER_COLOURS = ("#c0392b", "#2e8b57", "#2f6fb5")
 DIFFERENCE_SPAN = 0.2  # the difference's colour scale runs to +- this share of the reference's 99th percentile
 
 

@@ -29,10 +29,10 @@ from pipeline.calibrate.calibration import (
 from pipeline.calibrate.peaks import Peak, brightness, find_peak, footprint, seen
 from pipeline.calibrate.photometric import with_places
 from pipeline.calibrate.pose import PoseFit, fit_poses
-from pipeline.calibrate.projector_fit import GATE, ProjectorFit, StepSize, projection, refine, step_size
+from pipeline.calibrate.projector_fit import GATE, ProjectorFit, StepSize, refine, step_size, true_spots
 from pipeline.calibrate.projector_prior import nominal_projector, with_pose_error
 from pipeline.calibrate.response import Response
-from pipeline.calibrate.target_images import CameraImages, intact, measure_response, read_targets
+from pipeline.calibrate.target_images import CameraImages, measure_response, read_targets
 from pipeline.geometry.camera import turn
 from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.nominal_rig import RigConfig
@@ -56,7 +56,6 @@ class RigMeasurement:
     cameras: tuple[CameraImages, ...]
     poses: PoseFit
     projector: ProjectorFit
-    step_size: StepSize
     response: Response | None = None  # None: the camera is linear
 
 
@@ -78,7 +77,7 @@ def measure(capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh
         watts = mean_power(stream)
     for text in poses.ambiguity:
         log.warning("the silhouettes leave open: %s", text)
-    return RigMeasurement(assemble(rig, sensor, cameras, poses, fit, watts), tuple(cameras), poses, fit, size, response)
+    return RigMeasurement(assemble(rig, sensor, cameras, poses, fit, watts), tuple(cameras), poses, fit, response)
 
 
 def measure_poses(
@@ -91,7 +90,7 @@ def measure_poses(
     """From the silhouette image of every view."""
     images = []
     for view in range(stream.plan.views):
-        raw = intact(stream.read(ImageAddress(view, "silhouette")))
+        raw = stream.read(ImageAddress(view, "silhouette"))
         images.append(to_radiance(raw, sensor, 0).radiance / cameras[stream.plan.camera_of(view)].lens.illumination())
     lenses = [c.lens.seen_from(turn(angles[0])) for c in cameras]
     return fit_poses(images, mesh, lenses, angles, [c.intrinsics.covariance for c in cameras])
@@ -179,7 +178,7 @@ def measure_projector(
     steps = np.array([(plan.spots[s].u, plan.spots[s].v) for s in spot], float)
     of_angle = np.array([plan.spots[s].angle for s in spot])
     group = np.unique(np.concatenate(patches), return_inverse=True)[1]
-    true = projection(place, steps, FALSE_STEPS, np.random.default_rng(0)).inliers
+    true = true_spots(place, steps, FALSE_STEPS, np.random.default_rng(0))
     fit = refine(nominal, place[true], steps[true], normal[true], eye[true], size, group[true], place_error)
     # A matrix from a few noisy spots is a coarse sieve; the model itself says better which sightings are true. It also
     # says how the beam lies on the surface, and so where the light's centroid is beside the axis.

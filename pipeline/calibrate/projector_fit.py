@@ -1,9 +1,8 @@
 """Where the projector stands, from spots whose place on the surface is known (thesis 5.2.3), and its step size.
 
 First the projection matrix: homogeneous DLT by SVD with Hartley's normalisation, drawn many times from few spots so
-that false ones do not matter; the centre is the matrix's null vector. (The thesis prints 1, 2, 3 in the fourth column,
-which is 1, fixes t3 = 1, singular where t3 is near 0, and takes t for the centre.) Then the two-mirror model by least
-squares, started from what the rig was built to be.
+that false ones do not matter. (The thesis prints 1, 2, 3 in the fourth column, which is 1, and fixes t3 = 1, singular
+where t3 is near 0.) Then the two-mirror model by least squares, started from what the rig was built to be.
 """
 
 from __future__ import annotations
@@ -31,20 +30,6 @@ GATE = 5.0  # beyond this many scatters a spot is false
 STEPS = 15
 
 
-@dataclass(frozen=True)
-class Projection:
-    """matrix: (3, 4), homogeneous (x, y, z, 1) in mm -> steps; centre: (3,) mm; inliers: (N,)."""
-
-    matrix: F64
-    centre: F64
-    inliers: Bool
-
-    def steps(self, points: F64) -> F64:
-        """(N, 3) mm -> (N, 2) steps."""
-        u, v, w = (np.column_stack([points, np.ones(len(points))]) @ self.matrix.T).T
-        return np.column_stack([u / w, v / w])
-
-
 def dlt(points: F64, steps: F64) -> F64:
     """(3, 4) projection matrix from (N, 3) mm and (N, 2) steps, N >= 6 (Hartley and Zisserman 2004, algorithm 7.1)."""
     here, there = _normaliser(points), _normaliser(steps)
@@ -68,8 +53,8 @@ def _normaliser(points: F64) -> F64:
     return out
 
 
-def projection(points: F64, steps: F64, tolerance: float, rng: np.random.Generator) -> Projection:
-    """Robust DLT: `tolerance` in steps separates true spots from false ones.
+def true_spots(points: F64, steps: F64, tolerance: float, rng: np.random.Generator) -> Bool:
+    """(N,) spots that one projection matrix fits, by robust DLT; `tolerance` in steps separates them from false ones.
 
     Raises: DiscoError where too few spots agree, or nearly coplanar ones do.
     """
@@ -87,10 +72,8 @@ def projection(points: F64, steps: F64, tolerance: float, rng: np.random.Generat
                 "Remedy: check the object's pose and the mirrors' directions"
             )
         require_depth(points[best])
-        matrix = dlt(points[best], steps[best])
-        best = _misses(matrix, points, steps) < tolerance
-    null = np.linalg.svd(matrix)[2][-1]
-    return Projection(matrix, null[:3] / null[3], best)
+        best = _misses(dlt(points[best], steps[best]), points, steps) < tolerance
+    return best
 
 
 def require_depth(points: F64) -> None:
@@ -110,8 +93,10 @@ def require_depth(points: F64) -> None:
 
 
 def _misses(matrix: F64, points: F64, steps: F64) -> F64:
+    """(N,) steps; matrix: (3, 4), homogeneous (x, y, z, 1) in mm -> steps."""
+    u, v, w = (np.column_stack([points, np.ones(len(points))]) @ matrix.T).T
     with np.errstate(divide="ignore", invalid="ignore"):
-        away = np.linalg.norm(Projection(matrix, np.zeros(3), np.zeros(0, bool)).steps(points) - steps, axis=1)
+        away = np.linalg.norm(np.column_stack([u / w, v / w]) - steps, axis=1)
     return np.asarray(np.where(np.isfinite(away), away, np.inf))
 
 

@@ -11,16 +11,16 @@ import numpy as np
 from hw.base.arrays import F64, U16
 from hw.base.config import read_json
 from hw.base.errors import DiscoError, InputError
-from hw.record import RawImage, Sensor, to_radiance
+from hw.record import Sensor, to_radiance
 from pipeline.calibrate.intrinsics import Intrinsics, board_pose, find_corners, fit_intrinsics
 from pipeline.calibrate.peaks import find_peak, seen
 from pipeline.calibrate.photometric import WhiteBalance, balance, pixel_areas
 from pipeline.calibrate.response import Response, fit_response
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.geometry.nominal_rig import RigConfig
+from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
 from pipeline.plan.plan import ImageAddress
 from pipeline.plan.targets import BRACKET, FOLDER, TARGETS, Targets
-from pipeline.stream.stream import CorruptImage, StreamReader
+from pipeline.stream.stream import StreamReader
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ def measure_response(capture: Path, rig: RigConfig, sensor: Sensor) -> Response:
     for camera in rig.cameras:
         with StreamReader(capture / FOLDER / camera.name / BRACKET) as stream:
             stream.require_complete()
-            images.append([intact(raw).charge for raw in stream])
+            images.append([stream.read(index).charge for index in range(len(stream))])
         if len(images[-1]) != len(images[0]):
             first = rig.cameras[0].name
             raise InputError(
@@ -60,12 +60,6 @@ def measure_response(capture: Path, rig: RigConfig, sensor: Sensor) -> Response:
     return fit_response(together, seconds, sensor)
 
 
-def intact(raw: RawImage | CorruptImage) -> RawImage:
-    if isinstance(raw, CorruptImage):
-        raise raw
-    return raw
-
-
 def read_targets(folder: Path, rig: RigConfig, camera: int, sensor: Sensor) -> CameraImages:
     """Lens and white balance of one camera. Raises: InputError, DiscoError where the targets do not tell them."""
     targets = read_json(folder / TARGETS, Targets, "take the calibration images again")
@@ -75,7 +69,7 @@ def read_targets(folder: Path, rig: RigConfig, camera: int, sensor: Sensor) -> C
         corners: dict[int, F64 | None] = {}
         for i, place in enumerate(targets.placements):
             if place.kind == "board":
-                raw = intact(stream.read(ImageAddress(i, "silhouette")))
+                raw = stream.read(ImageAddress(i, "silhouette"))
                 corners[i] = find_corners(to_radiance(raw, sensor, 0).radiance, board)
         found = fit_intrinsics(list(corners.values()), board, nominal)
         lens = found.lens(nominal)
@@ -112,7 +106,7 @@ def _plates(
             sums, watts, peaks = [], [], []
             for laser in range(lasers):
                 address = ImageAddress(i, "spot", spot, laser)
-                image = to_radiance(intact(stream.read(address)), sensor, laser)
+                image = to_radiance(stream.read(address), sensor, laser)
                 radiance = image.radiance * gain
                 sums.append(float((radiance * area).sum(dtype=np.float64)) / share[laser])
                 watts.append(stream.meta(address).photodiode_w)
@@ -143,9 +137,9 @@ def _plates(
     return white, np.array(points), np.array(steps, float)
 
 
-def _same_side(config: object, rig: RigConfig, pose: F64) -> bool:
+def _same_side(config: CameraConfig, rig: RigConfig, pose: F64) -> bool:
     """Whether the camera sees the plate's lit side (nominally)."""
-    to_camera = np.subtract(config.position_mm, pose[:3, 3])  # type: ignore[attr-defined]
+    to_camera = np.subtract(config.position_mm, pose[:3, 3])
     to_laser = np.subtract(rig.projector.position_mm, pose[:3, 3])
     return bool((to_camera @ pose[:3, 2]) * (to_laser @ pose[:3, 2]) > 0)
 

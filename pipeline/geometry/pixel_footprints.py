@@ -1,4 +1,4 @@
-"""From an image to the surface: what the rays through its pixels meet. The way back is `views.image_points`."""
+"""From an image to the surface: what the rays through its pixels meet. The way back: `image_operators`."""
 
 from __future__ import annotations
 

@@ -6,8 +6,6 @@ Kobbelt 2004): throughput factors are symmetric on those only.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import gpytoolbox
 import numpy as np
 import trimesh
@@ -18,31 +16,16 @@ from hw.base.errors import InputError
 
 PSR_DEPTH = 7  # cells of 1/128 of the object's extent
 SCREENING = 0.5  # weight of single points against smoothness: their noise is averaged
-SCANNER_MM = 0.1  # the scanner's own geometry error (thesis 4.4: at most 0.3 mm with spray)
-PATCH_POINTS = 200  # neighbours whose mean distance says where the surface itself lies
+LEAST_POINTS = 800
 
 
-@dataclass(frozen=True)
-class Surface:
-    """mesh: closed, outward, mm.
-
-    noise_mm: root mean square distance of single points from the mesh; depth_error_mm: of the mesh from the object, one
-    standard deviation: what the mesh fails to follow, and what the scanner errs by alike over whole patches, which no
-    scan can tell from the object's shape
-    """
-
-    mesh: trimesh.Trimesh
-    noise_mm: float
-    depth_error_mm: float
-
-
-def reconstruct_surface(points: F64, normals: F64, vertices: int) -> Surface:
-    """(N, 3) points in mm with (N, 3) outward normals -> a mesh of about `vertices` vertices.
+def reconstruct_surface(points: F64, normals: F64, vertices: int) -> trimesh.Trimesh:
+    """(N, 3) points in mm with (N, 3) outward normals -> a closed mesh, outward, of about `vertices` vertices.
 
     Raises: InputError for too few points, or points that no closed surface follows.
     """
-    if len(points) < 4 * PATCH_POINTS:
-        raise InputError("too few points", key="points", value=len(points), allowed=f"at least {4 * PATCH_POINTS}")
+    if len(points) < LEAST_POINTS:
+        raise InputError("too few points", key="points", value=len(points), allowed=f"at least {LEAST_POINTS}")
     v, f = gpytoolbox.point_cloud_to_mesh(
         points.astype(np.float64), normals.astype(np.float64), psr_screening_weight=SCREENING, psr_depth=PSR_DEPTH
     )
@@ -68,12 +51,7 @@ def reconstruct_surface(points: F64, normals: F64, vertices: int) -> Surface:
         mean = np.bincount(nearest, distance, minlength=len(mesh.vertices)) / np.maximum(count, 1)
         pushed = mesh.vertices + mean[:, None] * mesh.vertex_normals
         mesh = trimesh.Trimesh(pushed, mesh.faces, process=False)
-    distance = _outside(mesh, points)
-    neighbours = cKDTree(points).query(points[:: max(1, len(points) // 500)], PATCH_POINTS)[1]
-    patches = distance[neighbours].mean(axis=1)
-    noise = float(np.sqrt((distance**2).mean()))
-    unfollowed = float(np.sqrt(max((patches**2).mean() - noise**2 / PATCH_POINTS, 0.0)))
-    return Surface(mesh, noise, float(np.hypot(unfollowed, SCANNER_MM)))
+    return mesh
 
 
 def _outside(mesh: trimesh.Trimesh, points: F64) -> F64:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,18 +12,6 @@ from pipeline.reconstruct.samples.samples import Samples
 
 LOCAL_SHARE = 0.99  # of the observed light within one edge: nothing is left for a global term
 SAME_COLOUR = 2.0  # standard errors (and a thousandth) within which two lasers' samples count as equal
-
-
-@dataclass(frozen=True)
-class Omission:
-    """One thing left out and why."""
-
-    what: str
-    because: str
-
-    def row(self) -> dict[str, str]:
-        """As it stands in the summary."""
-        return asdict(self)
 
 
 def share_within_an_edge(samples: Samples) -> float:
@@ -68,18 +54,18 @@ def _equal(values: NDArray[np.float32], variance: NDArray[np.float32]) -> bool:
     return bool(abs(difference) <= SAME_COLOUR * noise + 1e-3 * abs(total) and spread < SAME_COLOUR)
 
 
-def omissions(samples: Samples, calibration: Calibration) -> list[Omission]:
-    """What the pipeline left out for this capture."""
+def omissions(samples: Samples, calibration: Calibration) -> list[dict[str, str]]:
+    """Rows {what, because} of what the pipeline left out for this capture."""
     out = []
     if calibration.source == "nominal":
-        out.append(Omission("pose and projector estimation", "the calibration holds the nominal rig's geometry"))
+        out.append(("pose and projector estimation", "the calibration holds the nominal rig's geometry"))
     if not calibration.sensor.response:
-        out.append(Omission("response calibration", "the camera's digital numbers are linear by its data sheet"))
+        out.append(("response calibration", "the camera's digital numbers are linear by its data sheet"))
     if is_opaque(samples):
         share = share_within_an_edge(samples)
-        out.append(Omission("global term", f"{share:.1%} of the light leaves within one edge of its spot: opaque"))
+        out.append(("global term", f"{share:.1%} of the light leaves within one edge of its spot: opaque"))
     groups = colour_groups(samples)
     if len(groups) > 1 and len(set(groups)) < len(groups):
         kept = ", ".join(f"{calibration.lasers[k].wavelength_nm:g} nm" for k in sorted(set(groups)))
-        out.append(Omission("a model per wavelength", f"samples agree within their noise; solved for {kept} only"))
-    return out
+        out.append(("a model per wavelength", f"samples agree within their noise; solved for {kept} only"))
+    return [{"what": what, "because": because} for what, because in out]

@@ -89,11 +89,6 @@ def _received_from_many(
     return total
 
 
-def irradiance(light: Light, mesh: trimesh.Trimesh, face: I64, points: F64, lasers: int) -> F64:
-    """(L, N) plain irradiance in W/mm^2 at (N, 3) points on (N,) faces: no boundary, shadows of the mesh included."""
-    return received(RayMesh.of(mesh), light, face, points, 1.0, lasers, directions=1024)
-
-
 def _first_cells(surface: RayMesh, light: Light) -> tuple[I64, F64]:
     """Cells (C,) faces and (C, 3, 3) corners in barycentric coordinates, fine enough that no structure is missed."""
     longest = surface.size / (12 if isinstance(light, Uniform | Environment) else 40)
@@ -158,16 +153,14 @@ def hat_moments(
     return total
 
 
-def transmitted_flux(
-    light: Light, mesh: trimesh.Trimesh, eta: float | Boundary, lasers: int, accuracy: Accuracy | None = None
-) -> F64:
+def transmitted_flux(light: Light, mesh: trimesh.Trimesh, eta: float | Boundary, lasers: int) -> F64:
     """(L, V) flux q in W for radiosity = sum_u R_d[u, :] q_u, with R_d averaged over hat functions.
 
     q = A M^-1 (moments), with the mass matrix M and the vertex areas A: the flux density is projected onto the hat
     functions and multiplied by their areas. The sum over the vertices is the total transmitted flux. See
     docs/decisions/0005-flux-projection.md for why.
     """
-    moments = hat_moments(light, mesh, eta, lasers, accuracy)
+    moments = hat_moments(light, mesh, eta, lasers)
     surface = RayMesh.of(mesh)
     density = sparse_linalg.spsolve(surface.mass_matrix, moments.T).reshape(surface.vertices, lasers)
     return np.asarray((density * surface.vertex_areas[:, None]).T)

@@ -65,12 +65,6 @@ class ViewOfMesh:
         at = np.repeat(rays.pixel, 3), self.mesh.faces[rays.triangle].ravel()
         return sparse.csr_matrix(((self.weight[:, None] * rays.barycentric).ravel(), at), shape=shape)
 
-    @property
-    def coverage(self) -> F64:
-        """(H, W) share of the pixel that the object fills, 0..1."""
-        shape = self.camera.height, self.camera.width
-        return np.bincount(self.rays.pixel, minlength=shape[0] * shape[1]).reshape(shape) / self.supersample**2
-
     def image(self, radiosity: F64) -> F32:
         """(L, V) radiosity in W/mm^2 -> (L, H, W) radiance in W/(mm^2 sr), averaged over each pixel."""
         flat = np.asarray(self.matrix @ np.asarray(radiosity, np.float64).T)

@@ -41,7 +41,6 @@ class RelitScore:
     energy_ratio: float
     nrmse2: float
     nrmse2_se: float
-    pixels: int
 
 
 def signed_root(square: float) -> float:
@@ -95,7 +94,6 @@ def score_relit(image: ArrayLike, half_a: ArrayLike, half_b: ArrayLike, mask: Bo
         energy_ratio=float(i.sum() / mean.sum()),
         nrmse2=nrmse2,
         nrmse2_se=nrmse2_se,
-        pixels=int(np.count_nonzero(mask)),
     )
 
 
@@ -106,7 +104,6 @@ class DecadeScore:
     decade:      0 for (peak/10, peak], -1 for the next, ...
     log10_rmse:  root mean square of log10(estimate / truth) over the covered entries, the truth's own noise removed
                  (signed root); log10_bias: the mean; None where no entry is covered
-    floor:       the root mean square that the truth's noise had added
     coverage:    share of the decade's entries that the estimate covers
     entries:     number of entries of the decade
     """
@@ -114,7 +111,6 @@ class DecadeScore:
     decade: int
     log10_rmse: float | None
     log10_bias: float | None
-    floor: float
     coverage: float
     entries: int
 
@@ -148,7 +144,6 @@ def score_reflectance(
                 decade=-decade,
                 log10_rmse=signed_root(float((off[chosen] ** 2).mean()) - removed) if count else None,
                 log10_bias=float(off[chosen].mean()) if count else None,
-                floor=math.sqrt(removed),
                 coverage=count / entries if entries else 0.0,
                 entries=entries,
             )

@@ -260,14 +260,6 @@ class StreamReader:
         """All images in order, as `read_many`."""
         return self.read_many(range(len(self)))
 
-    def verify(self) -> list[CorruptImage]:
-        """Every damaged image: checks all checksums without decompressing."""
-        return [
-            CorruptImage(i, self.plan.address(i), "its checksum differs")
-            for i in range(len(self))
-            if not self._files.intact(i)
-        ]
-
     def bytes_raw(self) -> int:
         """Size of all images uncompressed, three bytes a pixel."""
         return sum(e.height * e.width * 3 for e in map(self._files.entry, range(len(self))) if e is not None)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from disco_twin.faults.actual_rig import actual_rig
-from pipeline.calibrate.projector_fit import ProjectorFit, StepSize, projection, refine
+from pipeline.calibrate.projector_fit import ProjectorFit, StepSize, refine, true_spots
 from pipeline.geometry.projector import TwoMirrorProjector
 
 F64 = NDArray[np.float64]
@@ -60,7 +60,7 @@ def lit(seed: int, noise: float = 0.05, false: float = 0.2) -> Lit:
 
 def fitted(spots: Lit, **changes: object) -> ProjectorFit:
     spots = replace(spots, **changes)  # type: ignore[arg-type]
-    kept = projection(spots.seen, spots.steps, 40.0, np.random.default_rng(0)).inliers
+    kept = true_spots(spots.seen, spots.steps, 40.0, np.random.default_rng(0))
     arguments = (spots.seen[kept], spots.steps[kept], spots.normals[kept], spots.to_eye[kept], spots.size)
     return refine(spots.nominal, *arguments)
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from blocked_renderer import BLOCK
+from damaged_images import damaged_images
 
 from hw.base.clock import WallClock
 from hw.serial.link import Link
@@ -181,7 +182,7 @@ def test_capture_killed_resumed_and_looked_at(rig: Path, camera: Any, tmp_path: 
     out = begin_again(scene, out, rig, before)
     with StreamReader(out / "capture") as stream:
         stream.require_complete()
-        assert stream.verify() == [] and len(stream) == 32
+        assert damaged_images(stream) == [] and len(stream) == 32
         assert all(abs(stream.meta(i).photodiode_w - 0.01) < 1e-4 for i in range(len(stream)) if i not in (0, 16))
     status, said = finish(disco_twin("quality", out / "capture"))
     assert status == 0 and said.count("front") == 2, said

@@ -16,6 +16,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from hw.base.arrays import F32, F64, I64, Bool
 from pipeline.geometry.fresnel import Boundary
+from pipeline.geometry.mesh import RayMesh
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.completion import measured_entries
@@ -33,15 +34,11 @@ def distribute(samples: Samples, laser: int) -> tuple[F64, Bool]:
 
     A spot counts for the three vertices of its triangle by its barycentric coordinates; several spots are averaged.
     """
-    size = len(samples.mesh.vertices)
     used = np.flatnonzero(samples.spots.transmitted > 0)
     value = samples.values[laser, used].astype(np.float64)
     seen = np.isfinite(value)
-    rows = samples.mesh.faces[samples.spots.triangle[used]]
-    share = samples.spots.barycentric[used]
-    to_vertices = sparse.csr_array(
-        (share.ravel(), (rows.ravel(), np.repeat(np.arange(len(used)), 3))), shape=(size, len(used))
-    )
+    spots = samples.spots
+    to_vertices = RayMesh.of(samples.mesh).interpolation(spots.triangle[used], spots.barycentric[used]).T.tocsr()
     weight = to_vertices @ seen.astype(np.float64)
     total = to_vertices @ np.where(seen, value, 0.0)
     known = weight > 1e-3

@@ -20,6 +20,7 @@ from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg
 
 from hw.base.arrays import F32, F64, Bool
+from pipeline.geometry.mesh import RayMesh
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.boundary_fit import measure_boundary
@@ -143,14 +144,8 @@ def hold_measured(
     triangle the vertex belongs to are averaged by their share and precision, and by reciprocity from both sides. A
     measured entry is the mean of that and of the fill, by their precisions: the sample itself unless noise drowns it.
     """
-    used = np.flatnonzero(samples.spots.transmitted > 0)
-    share = sparse.csr_array(
-        (
-            samples.spots.barycentric[used].ravel(),
-            (samples.mesh.faces[samples.spots.triangle[used]].ravel(), np.repeat(used, 3)),
-        ),
-        shape=(len(samples.mesh.vertices), len(samples.values[0])),
-    )
+    barycentric = np.where(samples.spots.transmitted[:, None] > 0, samples.spots.barycentric, 0.0)
+    share = RayMesh.of(samples.mesh).interpolation(samples.spots.triangle, barycentric).T.tocsr()
     squared, measured_in_all = share.multiply(share).tocsr(), measured_entries(samples)
     entries, variances = [], []
     for laser, fit in enumerate(fits):

@@ -237,7 +237,11 @@ def take_samples(
         ViewReader.of(view, calibration, mesh, {sampling: views[view] for sampling, views in readings.items()})
         for view in range(plan.views)
     ]
-    glow = tuple(_no_glow(calibration.view_camera(v), lasers, len(plan.spots)) for v in range(plan.views))
+    cameras = [calibration.view_camera(view) for view in range(plan.views)]
+    glow = tuple(
+        SpotSumImage(c, np.zeros((lasers, c.height, c.width)), np.zeros((lasers, len(plan.spots)), bool))
+        for c in cameras
+    )
     sums = {(reader.view, laser): Sums.zeros(reader.gain.shape) for reader in readers for laser in range(lasers)}
     hidden = highlights(spots, calibration, plan, mesh, settings.highlight_deg)
     images, lost, saturated, masked = 0, [], 0, 0
@@ -270,10 +274,6 @@ def take_samples(
         coverage=float(np.isfinite(first.values).mean()),
     )
     return samples, statistics
-
-
-def _no_glow(camera: PinholeCamera, lasers: int, spots: int) -> SpotSumImage:
-    return SpotSumImage(camera, np.zeros((lasers, camera.height, camera.width)), np.zeros((lasers, spots), bool))
 
 
 def highlights(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
+from plain_irradiance import irradiance
 from scipy.integrate import dblquad
 
 from hw.base.errors import InputError
@@ -13,7 +14,7 @@ from pipeline.geometry.camera import look_at
 from pipeline.geometry.fresnel import mean_transmittance, transmittance
 from pipeline.geometry.mesh import RayMesh
 from pipeline.relight.incident_light import from_many_directions
-from pipeline.relight.irradiance import Accuracy, hat_moments, irradiance, transmitted_flux
+from pipeline.relight.irradiance import Accuracy, hat_moments, transmitted_flux
 from pipeline.relight.lights import (
     Beam,
     Directional,
