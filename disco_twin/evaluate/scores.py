@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -47,18 +46,13 @@ def score_run(experiment: Experiment, folder: RunFolder, methods: Sequence[str])
         "relit": score_relit_images(experiment, folder, methods),
         "reflectance": score_reflectances(folder, {m: partial(load_model, folder, m) for m in methods}),
     }
-    write_json(scores_file(folder), scores)
-
-
-def scores_file(folder: RunFolder) -> Path:
-    """Where the scores lie: with the truth that they were made from, apart from the pipeline's work."""
-    return folder.twin / "scores.json"
+    write_json(folder.scores_file, scores)
 
 
 def load_scores(folder: RunFolder) -> dict[str, Any]:
     """What `score_run` wrote."""
     remedy = f"delete it, then disco-twin score --out {folder.root}"
-    return read_json(scores_file(folder), _Scores, remedy).model_dump()
+    return read_json(folder.scores_file, _Scores, remedy).model_dump()
 
 
 def score_relit_images(experiment: Experiment, folder: RunFolder, methods: Sequence[str]) -> list[dict[str, Any]]:

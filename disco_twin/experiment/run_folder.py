@@ -64,6 +64,7 @@ class RunFolder:
         self.scene_file, self.journal = self.root / "scene.toml", self.root / "stages.json"
         self.scene_record = self.root / "scene.json"  # the scene as it was run: profile applied, file names absolute
         self.summary_file, self.report_file = self.root / "summary.json", self.root / "report.html"
+        self.scores_file = self.twin / "scores.json"  # with the truth that they were made from
         self.devices_record = self.capture / "devices.toml"  # the rig file of a capture by devices
 
     def read_scene(self) -> Scene:

@@ -20,6 +20,7 @@ from hw.base.errors import DiscoError
 
 log = logging.getLogger(__name__)
 
+ON_LLVM = "llvm_ad_mono"  # Mitsuba's variant
 OLDEST_LLVM = 16
 ENVIRONMENT_KEY = "DRJIT_LIBLLVM_PATH"
 REMEDY = (
@@ -31,14 +32,6 @@ TOO_OLD = f"which aborts Dr.Jit 1.5 in the middle of a render (allowed: {OLDEST_
 
 class BackendError(DiscoError):
     """No usable renderer; the message names the remedy."""
-
-
-@dataclass(frozen=True)
-class Library:
-    """An LLVM library: its path and its major version (None: it could not be loaded, or is not stated)."""
-
-    path: str
-    version: int | None
 
 
 @dataclass(frozen=True)
@@ -100,8 +93,8 @@ def _existing(folder: Path, patterns: Iterable[str]) -> list[str]:
     return [str(p) for p in sorted(found, key=lambda p: [int(n) for n in re.findall(r"\d+", str(p))], reverse=True)]
 
 
-def choose_llvm(paths: Iterable[str], chosen_by_user: str | None) -> tuple[Library, str]:
-    """The library to use and the reason. A user's own choice is taken or refused, never replaced.
+def choose_llvm(paths: Iterable[str], chosen_by_user: str | None) -> Backend:
+    """The LLVM library to use and the reason. A user's own choice is taken or refused, never replaced.
 
     Raises: BackendError where no library can be used.
     """
@@ -111,7 +104,7 @@ def choose_llvm(paths: Iterable[str], chosen_by_user: str | None) -> tuple[Libra
             raise BackendError(f"{ENVIRONMENT_KEY}={chosen_by_user} is no loadable LLVM library. Remedy: {REMEDY}")
         if version < OLDEST_LLVM:
             raise BackendError(f"{ENVIRONMENT_KEY}={chosen_by_user} is LLVM {version}, {TOO_OLD}")
-        return Library(chosen_by_user, version), f"chosen by {ENVIRONMENT_KEY}"
+        return Backend(ON_LLVM, chosen_by_user, version, f"chosen by {ENVIRONMENT_KEY}")
     refused: dict[int, str] = {}
     for path in paths:
         version = llvm_version(path)
@@ -119,7 +112,7 @@ def choose_llvm(paths: Iterable[str], chosen_by_user: str | None) -> tuple[Libra
             continue
         if version >= OLDEST_LLVM:
             own = path.startswith(str(Path(sys.prefix) / "lib"))
-            return Library(path, version), "from this Python environment" if own else "from the system"
+            return Backend(ON_LLVM, path, version, "from this Python environment" if own else "from the system")
         refused.setdefault(version, path)
     if refused:
         raise BackendError(f"only LLVM {', '.join(map(str, sorted(refused)))} found, {TOO_OLD}")
@@ -149,9 +142,9 @@ def activate() -> Backend:
     if ENVIRONMENT_KEY not in os.environ and has_cuda_driver():
         backend = Backend("cuda_ad_mono", None, None, "a CUDA driver is present")
     else:
-        library, reason = _library()
-        os.environ[ENVIRONMENT_KEY] = library.path
-        backend = Backend("llvm_ad_mono", library.path, library.version, reason)
+        backend = _on_llvm()
+    if backend.llvm_path is not None:
+        os.environ[ENVIRONMENT_KEY] = backend.llvm_path
     try:
         import mitsuba as mi  # only now: Dr.Jit loads LLVM when it is imported
     except ImportError as error:
@@ -164,8 +157,8 @@ def activate() -> Backend:
     return backend
 
 
-def _library() -> tuple[Library, str]:
-    """The library to use and why; where drjit is imported already, the one that it holds, if that one works."""
+def _on_llvm() -> Backend:
+    """With the library to use and why; where drjit is imported already, the one that it holds, if that one works."""
     if "drjit" not in sys.modules:
         return choose_llvm(candidates(), os.environ.get(ENVIRONMENT_KEY))
     import drjit
@@ -177,4 +170,5 @@ def _library() -> tuple[Library, str]:
             f"drjit was imported before disco_twin.light.backend.activate() and holds {held} "
             f"(allowed: {OLDEST_LLVM} or newer). Remedy: call activate() before anything imports drjit or mitsuba"
         )
-    return Library(os.environ.get(ENVIRONMENT_KEY, "libLLVM"), int(version[0])), "drjit was imported before"
+    path = os.environ.get(ENVIRONMENT_KEY, "libLLVM")
+    return Backend(ON_LLVM, path, int(version[0]), "drjit was imported before")

@@ -111,14 +111,9 @@ class Calibration(Strict):
         """Number of turntable angles."""
         return len(self.projectors)
 
-    @property
-    def n_cameras(self) -> int:
-        """Number of cameras."""
-        return len(self.views) // self.n_angles
-
-    def views_at(self, angle: int) -> list[int]:
+    def views_at(self, angle: int) -> range:
         """The views (one per camera) that see the object at turntable angle number `angle`."""
-        return [camera * self.n_angles + angle for camera in range(self.n_cameras)]
+        return range(angle, len(self.views), self.n_angles)
 
     def view_camera(self, view: int) -> PinholeCamera:
         """The camera of a view in the object frame."""

@@ -8,7 +8,7 @@ a place. The order within an angle is coarse to fine: a capture that is broken o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -95,12 +95,7 @@ def _candidates(projectors: list[TwoMirrorProjector], mesh: trimesh.Trimesh, den
             cosine = -np.einsum("ij,ij->i", surface.normals[hit.triangle[ray]], direction[ray])
             position = origin[ray] + hit.distance[ray, None] * direction[ray]
             parts.append(Candidates(np.full(len(ray), angle), steps[ray], position, cosine))
-    return Candidates(
-        np.concatenate([p.angle for p in parts]),
-        np.concatenate([p.steps for p in parts]),
-        np.concatenate([p.position for p in parts]),
-        np.concatenate([p.cosine for p in parts]),
-    )
+    return Candidates(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Candidates)))
 
 
 def farthest_points(points: F64, cosine: F64, count: int) -> I64:

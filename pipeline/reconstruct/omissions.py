@@ -16,8 +16,7 @@ SAME_COLOUR = 2.0  # standard errors (and a thousandth) within which two lasers'
 
 def share_within_an_edge(samples: Samples) -> float:
     """Share of the observed light that leaves within one edge and the beam's radius of its spot."""
-    edge = float(samples.mesh.edges_unique_length.mean())
-    near = samples.spot_pairs.distance < edge + samples.spots.beam_radius
+    near = samples.spot_pairs.distance < samples.edge + samples.spots.beam_radius
     area = RayMesh.of(samples.mesh).vertex_areas
     power = np.stack([LaserSamples.of(samples, k).value * area for k in range(len(samples.values))])
     return float(power[:, near].sum() / max(power.sum(), 1e-30))

@@ -45,8 +45,7 @@ def _kernel(scattering: float, absorption: float, eta: float) -> Kernel:
 def fit_dipole_laser(samples: Samples, laser: int) -> tuple[float, float]:
     """(sigma_s', sigma_a) in 1/mm: logarithms of linear means over bins of distance, and of the observed total."""
     pairs, (measured, _) = samples.spot_pairs, over_directions(samples, laser)
-    edge = float(samples.mesh.edges_unique_length.mean())
-    bin_of = np.minimum((pairs.distance / (0.5 * edge)).astype(int), BINS)
+    bin_of = np.minimum((pairs.distance / (0.5 * samples.edge)).astype(int), BINS)
     area = np.broadcast_to(RayMesh.of(samples.mesh).vertex_areas, bin_of.shape)
 
     def totals(values: F64) -> F64:

@@ -37,8 +37,7 @@ def fit_lambertian(samples: Samples) -> RelightableModel:
     """The baseline: samples -> model. The albedo is kriged between the spots (Rasmussen & Williams 2006,
     eq. 2.25).
     """
-    edge = float(samples.mesh.edges_unique_length.mean())
-    covariance = harmonics(samples.mesh, MOST_HARMONICS).covariance(RANGE_EDGES * edge)
+    covariance = harmonics(samples.mesh, MOST_HARMONICS).covariance(RANGE_EDGES * samples.edge)
     to_spots = RayMesh.of(samples.mesh).interpolation(samples.spots.triangle, samples.spots.barycentric)
     albedos = []
     for laser in range(len(samples.values)):

@@ -114,7 +114,7 @@ class Fit:
 def fit_laser(samples: Samples, laser: int, field: SymmetricField, start: F32) -> Fit:
     """The profile and the field in turn. start: (n, n) first guess of Y, the laser's before."""
     pairs, vertex_pairs, measured = samples.spot_pairs, samples.vertex_pairs, LaserSamples.of(samples, laser)
-    edge = float(samples.mesh.edges_unique_length.mean())
+    edge = samples.edge
     scale, y, profile = deviation(measured.edges), start, None
     smooth = scale * field.at_spots(y)
     for _ in range(ROUNDS):
@@ -196,7 +196,7 @@ def measured_entries(samples: Samples) -> Bool:
 
 def complete(samples: Samples) -> RelightableModel:
     """Samples -> model of the global term alone, with the boundary that the images show."""
-    edge = float(samples.mesh.edges_unique_length.mean())
+    edge = samples.edge
     basis = harmonics(samples.mesh, MOST_HARMONICS)
     field = SymmetricField.of(basis, samples.lit, RANGE_EDGES * edge)
     fits: list[Fit] = []

@@ -51,7 +51,7 @@ class LaserSamples:
             np.where(observed, a[laser], 0.0).astype(np.float64)
             for a in (samples.values, samples.dark_variance, samples.noise_per_signal)
         )
-        edges = samples.spot_pairs.distance / float(samples.mesh.edges_unique_length.mean())
+        edges = samples.spot_pairs.distance / samples.edge
         return cls(value, observed, dark, noise, samples.oblique.astype(np.float64), edges)
 
     def variance(self, expected: F64) -> F64:
@@ -181,8 +181,7 @@ def over_directions(samples: Samples, laser: int) -> tuple[LaserSamples, Profile
     They have no directions; a mean over those that the cameras happened to look from would be too low.
     """
     measured = LaserSamples.of(samples, laser)
-    edge = float(samples.mesh.edges_unique_length.mean())
-    profile, direction_bias = fit_profile(samples.spot_pairs, measured, edge, samples.direction_bias)
+    profile, direction_bias = fit_profile(samples.spot_pairs, measured, samples.edge, samples.direction_bias)
     return replace(
         measured, value=measured.value * np.exp(-direction_bias(samples.spot_pairs.distance) * samples.direction_bias)
     ), profile

@@ -64,6 +64,11 @@ class Samples:
     direction_bias: F64
     glow: tuple[SpotSumImage, ...] = ()
 
+    @cached_property
+    def edge(self) -> float:
+        """Mean length of the scan's edges, mm."""
+        return float(self.mesh.edges_unique_length.mean())
+
     @property
     def variance(self) -> F32:
         """(L, S, V) variance of the values as measured, mm^-4."""
@@ -107,7 +112,7 @@ class _Gathered:
     """Readings of all spots by all cameras, by one sampling (footprint, bilinear).
 
     value: (L, S, C, V) mm^-2, NaN where not observed
-    scale: (L, S, C) what the images' radiances were multiplied with (`Part`), 0 where one is missing
+    scale: (L, S, C) what the images' radiances were multiplied with (`BatchResult`), 0 where one is missing
     noise, shot: (L, views, V) mm^-4, variance summed over the values of a view: as the images show it, and by the
         camera's model; dark: (L, views, V) variance of an image without signal, as of radiance / F_t
     """

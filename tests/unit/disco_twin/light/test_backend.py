@@ -22,14 +22,14 @@ def _injected(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_first_usable_candidate_wins_and_old_ones_are_passed_over() -> None:
-    library, reason = choose_llvm(["/a/other", "/a/llvm15", "/a/llvm16", "/a/llvm23"], None)
-    assert (library.path, library.version, reason) == ("/a/llvm16", 16, "from the system")
+    chosen = choose_llvm(["/a/other", "/a/llvm15", "/a/llvm16", "/a/llvm23"], None)
+    assert (chosen.llvm_path, chosen.llvm_version, chosen.reason) == ("/a/llvm16", 16, "from the system")
 
 
 def test_users_choice_is_honoured() -> None:
-    library, reason = choose_llvm(["/a/llvm23"], "/a/llvm16")
-    assert library.path == "/a/llvm16"
-    assert "DRJIT_LIBLLVM_PATH" in reason
+    chosen = choose_llvm(["/a/llvm23"], "/a/llvm16")
+    assert chosen.llvm_path == "/a/llvm16"
+    assert "DRJIT_LIBLLVM_PATH" in chosen.reason
 
 
 @pytest.mark.parametrize("choice", ["/a/llvm14", "/a/llvm15", "/a/other", "/nowhere"])

@@ -35,8 +35,8 @@ def test_views_are_cameras_outermost(calibration: Calibration) -> None:
     assert [(v.camera, round(np.degrees(v.angle_rad))) for v in calibration.views] == [
         (c, a) for c in "ab" for a in (0, 120, 240)
     ]
-    assert (calibration.n_cameras, calibration.n_angles) == (2, 3)
-    assert calibration.views_at(1) == [1, 4]
+    assert (len(calibration.views), calibration.n_angles) == (6, 3)
+    assert list(calibration.views_at(1)) == [1, 4]
 
 
 def test_view_cameras_and_spot_rays_are_the_nominal_rig_in_the_object_frame(calibration: Calibration) -> None:
