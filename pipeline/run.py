@@ -26,7 +26,7 @@ import trimesh
 
 from hw.base.config import Strict, read_json
 from hw.base.errors import DiscoError, InputError, refused_by_the_disk
-from hw.base.files import write_json
+from hw.base.files import replacing, write_json
 from hw.base.resources import measured
 from hw.record import Sensor
 from pipeline.calibrate.calibrate_rig import measure
@@ -118,7 +118,8 @@ def relight(models: dict[str, RelightableModel], request: Request, work: Path, s
             folder.mkdir(parents=True, exist_ok=True)
             for light, lit in shared[surface][0].items():
                 for view, seen in shared[surface][1].items():
-                    np.save(folder / f"{light}@{view}.npy", model.image(lit, seen))
+                    with replacing(folder / f"{light}@{view}.npy") as file:
+                        np.save(file, model.image(lit, seen))
         seconds[method] = time.perf_counter() - start
     return seconds
 

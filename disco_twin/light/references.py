@@ -15,7 +15,7 @@ import numpy as np
 
 from hw.base.arrays import F32
 from hw.base.errors import InputError
-from hw.base.files import require_version
+from hw.base.files import replacing, require_version
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.relight.lights import Light
 
@@ -78,9 +78,8 @@ def save_reference(path: Path, reference: Reference) -> None:
         "key": reference.key,
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    fresh = path.with_name(f"part-{path.name}")
-    OpenEXR.File(header, channels).write(str(fresh))
-    fresh.replace(path)
+    with replacing(path) as file:
+        OpenEXR.File(header, channels).write(file.name)
 
 
 def load_reference(path: Path) -> Reference:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import shutil
 import tempfile
 import zipfile
 import zlib
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -19,27 +20,34 @@ from numpy.typing import NDArray
 from hw.base.errors import DiscoError, InputError
 
 Arrays = dict[str, NDArray[Any]]
+DAMAGE = (  # what NumPy and zipfile raise where bytes of an archive are other ones
+    OSError, zipfile.BadZipFile, zlib.error, ValueError, EOFError, TypeError, AttributeError, RuntimeError,
+)  # fmt: skip
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
     """A new file that takes the place of `path` when the block ends: a reader, or a run after a crash, sees the old
-    content or the new.
+    content or the new. It keeps the mode of the old one, and what links to it.
 
     Raises: OSError where the disk refuses; it names `path`, and nothing is left of what was not written in full.
     """
-    fresh = path.with_name(path.name + ".part")
+    target = Path(os.path.realpath(path))
+    fresh = target.with_name(target.name + ".part")
     try:
+        fresh.unlink(missing_ok=True)  # a read-only one of a killed run could not be opened
         with fresh.open("wb") as file:
+            with suppress(FileNotFoundError):
+                shutil.copymode(target, fresh)
             yield file
             file.flush()
             os.fsync(file.fileno())
-        fresh.replace(path)
-    except OSError as error:
-        fresh.unlink(missing_ok=True)
-        raise OSError(error.errno, error.strerror, str(path)) from error
-    except BaseException:
-        fresh.unlink(missing_ok=True)
+        fresh.replace(target)
+    except BaseException as error:
+        with suppress(OSError):
+            fresh.unlink()
+        if isinstance(error, OSError) and error.errno is not None and error.filename in (None, str(fresh)):
+            raise OSError(error.errno, error.strerror, str(path)) from error
         raise
 
 
@@ -75,7 +83,7 @@ def load_arrays(
             return head, {name: data[name] for name in (data.files if names is None else names) if name != "head"}
     except FileNotFoundError as error:
         raise InputError("is missing", file=path, remedy=remedy) from error
-    except (OSError, zipfile.BadZipFile, zlib.error, ValueError, EOFError, TypeError, AttributeError) as error:
+    except DAMAGE as error:
         raise InputError("is damaged, or another kind of file", file=path, remedy=remedy) from error
     except KeyError as error:
         raise InputError(f"is damaged (it lacks {error})", file=path, remedy=remedy) from error

@@ -32,6 +32,7 @@ Shapes = Mapping[str, tuple[int, int]]
 
 TEST_ANGLE_DEG = 30.0
 ANGLE_TOLERANCE_DEG = 0.05
+TABLE_KEY = {"zaber": "microsteps_per_deg", "elliptec": "address"}  # what a wrong angle comes of
 FRAMES = 20
 
 
@@ -183,7 +184,7 @@ def selftest(
             yield DeviceFinding("gates", False, "left shut, and nothing moved: a laser did not confirm that it is off")
             return
         if file.turntable.port != EMULATED:
-            yield _try_on("turntable", connect.table, _test_table)
+            yield _try_on("turntable", connect.table, partial(_test_table, file.turntable.kind))
         for name, opened in _cameras(file, shapes):
             yield _try_on(name, opened, partial(_test_camera, file))
         if board is not None:
@@ -208,14 +209,14 @@ def _test_light(connect: Connector, board: Board, lasers: Mapping[str, int]) -> 
             yield _try(name, partial(_test_laser, connect, board, index))
 
 
-def _test_table(table: TurntableDriver) -> str:
+def _test_table(kind: str, table: TurntableDriver) -> str:
     table.home()
     for angle in (TEST_ANGLE_DEG, 0.0):
         table.move(float(np.deg2rad(angle)))
         off = (np.rad2deg(table.angle_rad()) - angle + 180.0) % 360.0 - 180.0
         if abs(off) > ANGLE_TOLERANCE_DEG:
             problem = f"reports to be {off:+.3f} deg from {angle:g} deg (allowed: {ANGLE_TOLERANCE_DEG:g} off)"
-            raise table.link.error(DeviceFault, problem, "check microsteps_per_deg in the rig file")
+            raise table.link.error(DeviceFault, problem, f"check {TABLE_KEY[kind]} in the rig file")
     return f"homed, turned to {TEST_ANGLE_DEG:g} deg and back"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,16 @@ def test_the_page_names_every_room_and_no_other(repository: Path, floor: str) ->
     rooms = re.findall(r"^  ([a-z0-9_]+)/ ", listed, re.M)
     assert len(set(rooms)) == len(rooms)
     assert set(rooms) | set(re.findall(r"\b[a-z0-9_]+/[a-z0-9_]+(?=/)", listed)) == packages(repository, floor)
+
+
+@pytest.mark.parametrize("floor", FLOORS)
+def test_the_page_lists_rooms_in_the_order_in_which_they_import(repository: Path, floor: str) -> None:
+    contracts = tomllib.loads((repository / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    (layers,) = (c["layers"] for c in contracts if c.get("containers") == [floor])
+    level = {room.strip(): -n for n, layer in enumerate(layers) for room in layer.split("|")}
+    (listed,) = re.findall(rf"^{floor}/ .*\n((?:  .*\n)*)", page(repository), re.M)
+    levels = [level[room] for room in re.findall(r"^  ([a-z0-9_]+)/ ", listed, re.M)]
+    assert levels == sorted(levels)
 
 
 def test_the_page_fits_a_screen_and_its_paths_exist(repository: Path) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from pipeline.run import Request
+
 FLOORS = r"(?:hw|pipeline|disco_twin|tests|benchmarks|scenes|docs)"
 SCREEN = 60  # lines
 
@@ -47,5 +49,12 @@ def test_a_decision_fits_a_screen(repository: Path) -> None:
     assert {name: n for name, text in pages.items() if (n := len(text.splitlines())) > SCREEN} == {}
     numbers = [name[:4] for name in pages]
     assert sorted(set(numbers)) == sorted(numbers)
+    assert [name for name, text in pages.items() if not text.startswith(f"# {name[:4]} ")] == []
     for diary in (repository / "docs" / "decisions" / "diary").glob("*.md"):
         assert f"](diary/{diary.name})" in pages[diary.name]
+
+
+def test_the_request_that_is_shown_can_be_read(repository: Path) -> None:
+    """The remedy for a request that cannot be read names this page."""
+    (shown,) = re.findall(r"`({\"format_version\".*?})`", (repository / "docs" / "conventions.md").read_text(), re.S)
+    assert Request.model_validate_json(shown).relight.lights[0].name == "sky"

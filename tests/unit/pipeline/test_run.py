@@ -7,6 +7,8 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import IO
 
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ from pipeline.reconstruct.samples.image_operators import bilinear_reading, footp
 from pipeline.reconstruct.samples.samples import take_samples
 from pipeline.reconstruct.samples.samples_file import load_samples
 from pipeline.reconstruct.settings import ReconstructConfig
-from pipeline.run import Request, main, run
+from pipeline.run import Request, Stages, main, relight, run
 from pipeline.stream.stream import StreamReader
 
 METHODS = ("default", "disco2004", "dipole", "lambertian")
@@ -157,6 +159,24 @@ def test_the_model_relights_the_sphere(result) -> None:  # type: ignore[no-untyp
         total = model.terms[0].reflectance[laser] @ area
         assert total.mean() == pytest.approx(exact, rel=0.03)
         assert total.std() < 0.03 * exact
+
+
+def test_a_relit_image_is_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    view, lights = rig().cameras[0].model_dump(), [{"kind": "uniform", "name": "u", "colour": [1, 1, 1]}]
+    request = Request.model_validate({"format_version": 1, "relight": {"views": [view], "lights": lights}})
+    same = {name: lambda *_: np.zeros(2) for name in ("lit_by", "seen_by", "image")}
+    models = {"dipole": SimpleNamespace(mesh=None, boundary=None, **same)}
+    relight(models, request, tmp_path, Stages())  # type: ignore[arg-type]
+    (image,) = tmp_path.rglob("*.npy")
+
+    def half(file: IO[bytes], _: object) -> None:
+        file.write(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "save", half)
+    with pytest.raises(KeyboardInterrupt):
+        relight(models, request, tmp_path, Stages())  # type: ignore[arg-type]
+    assert np.load(image).shape == (2,) and list(image.parent.iterdir()) == [image]
 
 
 def test_samples_are_read_back(captured, result, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]

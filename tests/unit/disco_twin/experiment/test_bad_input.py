@@ -9,6 +9,7 @@ from io import StringIO
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 import trimesh
 from rich.console import Console
@@ -20,7 +21,7 @@ from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.pipeline_process import load_results, pipeline_inputs, stale
 from disco_twin.experiment.references import render_references
 from disco_twin.experiment.run_folder import RunFolder
-from disco_twin.light.references import load_reference
+from disco_twin.light.references import Reference, load_reference, save_reference
 from disco_twin.light.truth import Truth
 from disco_twin.object.mesh import read_mesh
 from disco_twin.object.voxels import read_voxels
@@ -257,6 +258,21 @@ def test_references_that_are_gone_or_damaged(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         render_references(sphere(), tmp_path, path, lambda done, total: None)
     one_line(caught, str(path), "is not a folder", "another --out")
+
+
+def test_a_reference_is_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, halves = tmp_path / "uniform@left.exr", np.ones((2, 2, 1, 4, 5), np.float32)
+    save_reference(path, Reference(halves, 10, "old"))
+
+    def half(_: OpenEXR.File, name: str) -> None:
+        Path(name).write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(OpenEXR.File, "write", half)
+    with pytest.raises(OSError, match="No space left"):
+        save_reference(path, Reference(halves, 10, "new"))
+    assert load_reference(path).key == "old" and list(tmp_path.iterdir()) == [path]
+    np.testing.assert_allclose(load_reference(path).halves, halves, rtol=1e-3)  # half floats
 
 
 def test_a_model_that_does_not_belong_to_what_is_scored(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 from pathlib import Path
@@ -26,6 +27,28 @@ def test_a_disk_that_refuses_names_the_file_and_keeps_nothing(tmp_path: Path) ->
     with pytest.raises(OSError, match="No space left") as caught, replacing(path):
         raise OSError(28, "No space left on device")
     assert caught.value.filename == str(path) and not list(tmp_path.iterdir())
+
+
+def test_what_is_not_of_the_disk_stays_as_it_is(tmp_path: Path) -> None:
+    """An input that is missing is not the output's fault, and what has no number has a text."""
+    path = tmp_path / "file"
+    with pytest.raises(FileNotFoundError) as caught, replacing(path):
+        (tmp_path / "input").read_bytes()
+    assert caught.value.filename == str(tmp_path / "input")
+    with pytest.raises(OSError, match="16 requested and 0 written"), replacing(path):
+        raise OSError("16 requested and 0 written")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_replaced_file_keeps_its_mode_and_its_links(tmp_path: Path) -> None:
+    path, link = tmp_path / "file", tmp_path / "link"
+    path.write_bytes(b"old")
+    path.chmod(0o400)
+    (tmp_path / "file.part").touch(0o400)  # of a run that was killed
+    link.symlink_to(path)
+    write_atomically(link, b"new")
+    assert link.is_symlink() and path.read_bytes() == b"new" and path.stat().st_mode & 0o777 == 0o400
+    assert {*tmp_path.iterdir()} == {path, link}
 
 
 def test_json_holds_no_nan(tmp_path: Path) -> None:
@@ -59,18 +82,20 @@ def test_what_is_no_archive_is_refused(tmp_path: Path, content: bytes | None, sa
         load_arrays(path, 3, "make it again")
 
 
-@pytest.mark.parametrize("byte", range(40, 400, 24))
-def test_a_flipped_bit_is_no_traceback(tmp_path: Path, byte: int) -> None:
-    path = tmp_path / "a.npz"
-    save_arrays(path, 3, {"values": np.arange(4.0)})
-    data = bytearray(path.read_bytes())
-    data[byte] ^= 0x10
-    path.write_bytes(data)
-    try:
-        _, arrays = load_arrays(path, 3, "make it again", ["values"])
-    except InputError:
-        return
-    np.testing.assert_array_equal(arrays["values"], np.arange(4.0))  # a bit that nothing depends on
+def test_no_changed_byte_is_a_traceback(tmp_path: Path) -> None:
+    """Each byte of a small file in turn: a flipped bit, the last bit, all ones."""
+    path, values = tmp_path / "a.npz", np.arange(4.0)
+    save_arrays(path, 3, {"values": values})
+    whole, refused = path.read_bytes(), 0
+    for place, change in itertools.product(range(len(whole)), (0x01, 0x08, 0x10, 0x40, 0xFF)):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ change]) + whole[place + 1 :])
+        try:
+            _, arrays = load_arrays(path, 3, "make it again", ["values"])
+        except InputError:
+            refused += 1
+        else:
+            np.testing.assert_array_equal(arrays["values"], values)  # a byte that nothing depends on
+    assert refused > len(whole)
 
 
 def test_other_versions_and_lacking_arrays_are_named(tmp_path: Path) -> None:

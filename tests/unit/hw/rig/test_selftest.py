@@ -8,17 +8,19 @@ from __future__ import annotations
 import os
 import signal
 import time
+from types import SimpleNamespace
 
 import pytest
 from guard_fakes import guards_of
 from rig_fakes import emulation
 from rig_programs import GATE, Bench, devices, started
 
-from hw.base.errors import InputError
+from hw.base.errors import DeviceFault, InputError
 from hw.devices.omicron import OmicronLaser
 from hw.rig.connect import Connector
+from hw.rig.rig_file import ElliptecDevice, ZaberDevice
 from hw.rig.rig_rules import load_rig_file
-from hw.rig.selftest import selftest
+from hw.rig.selftest import _test_table, selftest
 from hw.safety.signals import interruptible
 
 __all__ = ["devices"]
@@ -144,3 +146,12 @@ def test_a_signal_that_python_lost_ends_the_warm_up(monkeypatch: pytest.MonkeyPa
         pass
     assert emulated.clock.now() - begun < 60
     assert emulated.bench.light() == [] and not any(head.on_since for head in emulated.bench.heads)
+
+
+@pytest.mark.parametrize(("kind", "device"), [("zaber", ZaberDevice), ("elliptec", ElliptecDevice)])
+def test_a_table_that_is_off_names_a_key_that_it_has(kind: str, device: type[ZaberDevice | ElliptecDevice]) -> None:
+    link = SimpleNamespace(error=lambda error, problem, remedy: error("COM1", "the turntable", problem, remedy))
+    table = SimpleNamespace(link=link, home=lambda: None, move=lambda angle: None, angle_rad=lambda: 1.0)
+    with pytest.raises(DeviceFault) as caught:
+        _test_table(kind, table)  # type: ignore[arg-type]
+    assert caught.value.remedy.split()[1] in device.model_fields
