@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, ClassVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hw.base.arrays import F32
+from hw.base.arrays import F32, F64, I64, Bool
 from pipeline.model.term import Axes, ReflectanceColumns, Term
 from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 
@@ -25,14 +26,29 @@ class GlobalTerm(Term):
     kind: ClassVar[str] = "global"
 
     reflectance: Annotated[F32, Axes(_PAIRS, "mm^-2")]
-    measured: Annotated[NDArray[np.bool_], Axes("vertex_in vertex_out", "1")]
+    measured: Annotated[Bool, Axes("vertex_in vertex_out", "1", kind="b")]
     variance: Annotated[F32 | None, Axes(_PAIRS, "mm^-4")] = None
 
     def image(self, light: LightOnMesh, view: ViewOfMesh) -> F32:
         """Radiosity on the vertices (thesis 5.3: B = E F), linear on the faces."""
-        return view.image(np.stack([q @ r for q, r in zip(light.flux, self.reflectance, strict=True)]))
+        if light not in self._radiosity:
+            self._radiosity[light] = np.stack([q @ r for q, r in zip(light.flux, self.reflectance, strict=True)])
+        return view.image(self._radiosity[light])
 
-    def reflectance_columns(self, vertices: Sequence[int] | NDArray[np.int64]) -> ReflectanceColumns:
+    @cached_property
+    def _radiosity(self) -> WeakKeyDictionary[LightOnMesh, F64]:
+        """(L, V) W/mm^2 by light: the product costs more than the image, and serves all views."""
+        return WeakKeyDictionary()
+
+    def check(self, lasers: int, vertices: int) -> None:
+        """Raises: ValueError as every term, and for a matrix that is not symmetric to float32's rounding."""
+        super().check(lasers, vertices)
+        for name, array in self.arrays().items():
+            other = array.swapaxes(-1, -2)
+            if not np.array_equal(array, other) and not np.allclose(array, other, 1e-4, 1e-6 * float(array.max())):
+                raise ValueError(f"{self.kind}.{name}: is not symmetric")
+
+    def reflectance_columns(self, vertices: Sequence[int] | I64) -> ReflectanceColumns:
         """The matrix's rows, which are its columns: R_d is symmetric."""
         variance = None if self.variance is None else self.variance[:, vertices]
         return ReflectanceColumns(self.reflectance[:, vertices], variance, self.measured[vertices])

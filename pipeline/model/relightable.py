@@ -52,7 +52,7 @@ class RelightableModel:
         return self.terms[0].lasers
 
     def lit_by(self, light: Light) -> LightOnMesh:
-        """A light on this model's surface. Models with the same mesh and boundary can share it."""
+        """A light on this model's surface. Models with the same mesh, boundary and number of lasers can share it."""
         return LightOnMesh(light, self.mesh, self.boundary, self.lasers)
 
     def seen_by(self, camera: PinholeCamera) -> ViewOfMesh:
@@ -62,11 +62,13 @@ class RelightableModel:
     def image(self, light: LightOnMesh, view: ViewOfMesh) -> F32:
         """(L, H, W) radiance in W/(mm^2 sr), averaged over each pixel.
 
-        Raises: ValueError where light or view were prepared for another surface.
+        Raises: ValueError where light or view were prepared for another surface, or the light for other lasers.
         """
         for prepared in (light, view):
-            if prepared.mesh is not self.mesh or prepared.boundary != self.boundary:
+            if prepared.boundary != self.boundary or not _same(prepared.mesh, self.mesh):
                 raise ValueError("prepared for another mesh or boundary: use the model's own lit_by and seen_by")
+        if light.lasers != self.lasers:
+            raise ValueError(f"prepared for {light.lasers} lasers, not {self.lasers}: use the model's own lit_by")
         # Where a term for near light and the global term describe the same entries, the shares that split R_d between
         # them (a partition of unity over distance, so that no energy counts twice) belong here, beside the sum.
         total = self.terms[0].image(light, view)
@@ -124,6 +126,10 @@ class RelightableModel:
             return cls(mesh, boundary, terms, head["provenance"])
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(f"is damaged, or no model ({error})", file=path, remedy=REMEDY) from error
+
+
+def _same(one: trimesh.Trimesh, other: trimesh.Trimesh) -> bool:
+    return one is other or (np.array_equal(one.vertices, other.vertices) and np.array_equal(one.faces, other.faces))
 
 
 def _units(terms: Sequence[Term]) -> dict[str, str]:

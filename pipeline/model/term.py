@@ -19,10 +19,12 @@ from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 
 
 class Axes:
-    """An array's axes, in order, and its unit. Axes of one stem (`vertex_in`, `vertex_out`) have one length."""
+    """An array's axes, in order, its unit, and NumPy's letter for its kind of numbers. Axes of one stem (`vertex_in`,
+    `vertex_out`) have one length.
+    """
 
-    def __init__(self, names: str, unit: str) -> None:
-        self.names, self.unit = tuple(names.split()), unit
+    def __init__(self, names: str, unit: str, kind: str = "f") -> None:
+        self.names, self.unit, self.kind = tuple(names.split()), unit, kind
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class Term(ABC):
         return replace(self, **taken)
 
     def check(self, lasers: int, vertices: int) -> None:
-        """Raises: ValueError where an array does not fit these or another, or holds numbers that are not finite."""
+        """Raises: ValueError for arrays that do not fit these or each other, are of another kind, or not finite."""
         known = {"laser": lasers, "vertex": vertices}
         for name, array in self.arrays().items():
             stems = [axis.split("_")[0] for axis in self.axes()[name].names]
@@ -82,5 +84,7 @@ class Term(ABC):
             ):
                 expected = ", ".join(f"{s} {known[s]}" if s in known else s for s in stems)
                 raise ValueError(f"{self.kind}.{name}: has the shape {array.shape}, not ({expected})")
-            if array.dtype.kind == "f" and not np.isfinite(array).all():
+            if array.dtype.kind != self.axes()[name].kind:
+                raise ValueError(f"{self.kind}.{name}: holds {array.dtype}, not kind {self.axes()[name].kind!r}")
+            if not np.isfinite(array).all():
                 raise ValueError(f"{self.kind}.{name}: holds values that are not finite")

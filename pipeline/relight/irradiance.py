@@ -153,14 +153,13 @@ def hat_moments(
     return total
 
 
-def transmitted_flux(light: Light, mesh: trimesh.Trimesh, eta: float | Boundary, lasers: int) -> F64:
+def flux_of(moments: F64, mesh: trimesh.Trimesh) -> F64:
     """(L, V) flux q in W for radiosity = sum_u R_d[u, :] q_u, with R_d averaged over hat functions.
 
     q = A M^-1 (moments), with the mass matrix M and the vertex areas A: the flux density is projected onto the hat
     functions and multiplied by their areas. The sum over the vertices is the total transmitted flux. See
     docs/decisions/0005-flux-projection.md for why.
     """
-    moments = hat_moments(light, mesh, eta, lasers)
     surface = RayMesh.of(mesh)
-    density = sparse_linalg.spsolve(surface.mass_matrix, moments.T).reshape(surface.vertices, lasers)
+    density = sparse_linalg.spsolve(surface.mass_matrix, moments.T).reshape(surface.vertices, len(moments))
     return np.asarray((density * surface.vertex_areas[:, None]).T)

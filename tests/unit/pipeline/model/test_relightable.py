@@ -17,6 +17,7 @@ from pipeline.model.lambertian import LambertianTerm
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
 from pipeline.relight.lights import Directional
+from pipeline.relight.on_mesh import ViewOfMesh
 
 MESH = trimesh.creation.icosphere(subdivisions=1, radius=15.0)
 V = len(MESH.vertices)
@@ -105,8 +106,53 @@ def test_terms_that_do_not_fit_are_refused() -> None:
         model(LambertianTerm(np.full((2, V), np.nan, np.float32)))
     with pytest.raises(ValueError, match="laser 2"):
         model(term, LambertianTerm(np.ones((3, V), np.float32)))
+    for held in (term.measured.astype(np.float32), term.measured.astype(int)):
+        with pytest.raises(ValueError, match=r"global.measured: holds (float32|int64), not kind 'b'"):
+            model(GlobalTerm(term.reflectance, held))
+    with pytest.raises(ValueError, match=r"global.reflectance: holds <U\d+, not kind 'f'"):
+        model(GlobalTerm(term.reflectance.astype(str), term.measured))
     with pytest.raises(ValueError, match="at least one term"):
         model()
+
+
+def test_a_matrix_that_is_not_symmetric_is_refused() -> None:
+    """Rationale: columns of R_d are read as rows. What rounding leaves (1e-7 of an entry) is no asymmetry."""
+    term = dense()
+    for name, array in term.arrays().items():
+        bent = array.copy()
+        bent[..., 3, 5] = ~bent[..., 3, 5] if array.dtype == bool else 1.01 * bent[..., 3, 5]
+        with pytest.raises(ValueError, match=f"global.{name}: is not symmetric"):
+            model(GlobalTerm(**(term.arrays() | {name: bent})))
+    rounded = np.triu(np.nextafter(term.reflectance, np.float32(1))) + np.tril(term.reflectance, -1)
+    assert (rounded != rounded.transpose(0, 2, 1)).any()
+    model(GlobalTerm(rounded, term.measured))
+
+
+def test_the_same_surface_loaded_twice_shares_lights_and_views(tmp_path: Path) -> None:
+    made = model(dense())
+    made.save(tmp_path / "model.npz")
+    one, two = (RelightableModel.load(tmp_path / "model.npz") for _ in range(2))
+    light, view = one.lit_by(Directional(direction=(-1, 0.3, 0))), one.seen_by(CAMERA)
+    np.testing.assert_array_equal(two.image(light, view), picture(made))
+    with pytest.raises(ValueError, match="prepared for 2 lasers, not 3"):
+        one.of_lasers([0, 1, 0]).image(light, view)
+    moved = RelightableModel(MESH.copy().apply_translation([1e-6, 0, 0]), BOUNDARY, (dense(),))
+    with pytest.raises(ValueError, match="another mesh or boundary"):
+        moved.image(light, view)
+
+
+def test_a_lights_radiosity_serves_all_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    of, drawn = model(dense()), []
+    monkeypatch.setattr(ViewOfMesh, "image", lambda view, radiosity: drawn.append(radiosity) or radiosity)
+    lights = [of.lit_by(Directional(direction=(-1, y, 0))) for y in (0.3, 0.4)]
+    for light in lights:
+        for _ in range(2):
+            of.image(light, of.seen_by(CAMERA))
+    assert drawn[0] is drawn[1]
+    assert drawn[2] is drawn[3]
+    for radiosity, light in zip(drawn[::2], lights, strict=True):
+        expected = np.einsum("lu,luv->lv", light.flux, of.terms[0].reflectance)
+        np.testing.assert_allclose(radiosity, expected, rtol=1e-12)
 
 
 def test_what_was_prepared_for_another_surface_is_refused() -> None:

@@ -11,10 +11,10 @@ from scipy.integrate import dblquad
 
 from hw.base.errors import InputError
 from pipeline.geometry.camera import look_at
-from pipeline.geometry.fresnel import mean_transmittance, transmittance
+from pipeline.geometry.fresnel import Boundary, mean_transmittance, transmittance
 from pipeline.geometry.mesh import RayMesh
 from pipeline.relight.incident_light import from_many_directions
-from pipeline.relight.irradiance import Accuracy, hat_moments, transmitted_flux
+from pipeline.relight.irradiance import Accuracy, hat_moments
 from pipeline.relight.lights import (
     Beam,
     Directional,
@@ -25,8 +25,13 @@ from pipeline.relight.lights import (
     Uniform,
     shipped_lights,
 )
+from pipeline.relight.on_mesh import LightOnMesh
 
 F64 = NDArray[np.float64]
+
+
+def transmitted_flux(light: Light, mesh: trimesh.Trimesh, eta: float, lasers: int) -> F64:
+    return LightOnMesh(light, mesh, Boundary(eta), lasers).flux
 
 
 def ball(subdivisions: int = 3, radius: float = 20.0) -> trimesh.Trimesh:
@@ -299,7 +304,9 @@ def test_turning_object_and_light_together_changes_nothing() -> None:
 def test_projection_keeps_the_total_and_a_constant_density() -> None:
     mesh = dented()
     light = Directional(direction=(1, 0.3, -0.4))
-    moments, q = hat_moments(light, mesh, 1.3, 1), transmitted_flux(light, mesh, 1.3, 1)
+    lit = LightOnMesh(light, mesh, Boundary(1.3), 1)
+    moments, q = lit.moments, lit.flux
+    np.testing.assert_array_equal(moments, hat_moments(light, mesh, 1.3, 1))
     assert q.sum() == pytest.approx(moments.sum(), rel=1e-12)
     surface = RayMesh.of(mesh)
     np.testing.assert_allclose(np.asarray(surface.mass_matrix.sum(axis=1)).ravel(), surface.vertex_areas)

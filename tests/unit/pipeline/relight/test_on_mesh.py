@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import trimesh
+from scipy import sparse
 
 from pipeline.geometry.camera import PinholeCamera, look_at
 from pipeline.geometry.fresnel import Boundary, transmittance
-from pipeline.relight.on_mesh import ViewOfMesh
+from pipeline.relight import on_mesh
+from pipeline.relight.lights import Uniform
+from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 
 
 def camera(position: tuple[float, float, float] = (450.0, 0.0, 80.0), focal: float = 1300.0) -> PinholeCamera:
@@ -38,7 +41,7 @@ def test_a_sphere_of_constant_radiosity_shows_f_t() -> None:
     exact = exact.reshape(62, 8, 96, 8).mean(axis=(1, 3))
     assert np.sqrt(((image[0] - exact) ** 2).mean() / (exact**2).mean()) < 4e-3
     assert image[1].sum() == pytest.approx(exact.sum(), rel=1e-3)
-    assert len(view.rays.pixel) / 16 == pytest.approx((square > 0).sum() / 64, rel=2e-3)
+    assert sum(len(rays.pixel) for rays in view.rays()) / 16 == pytest.approx((square > 0).sum() / 64, rel=2e-3)
 
 
 def test_radiosity_is_linear_on_faces_and_seen_where_the_camera_projects_it() -> None:
@@ -47,7 +50,8 @@ def test_radiosity_is_linear_on_faces_and_seen_where_the_camera_projects_it() ->
     distorted = replace(camera((450.0, 30.0, 80.0)), distortion=np.array([-0.9, 0.3, 0.01, -0.02, 0.0]))
     view = ViewOfMesh(distorted, mesh, Boundary(1.0), supersample=1)
     image = view.image((100 + corners @ [0, 2.0, -1.0])[None])[0]
-    inside = np.argwhere(np.bincount(view.rays.pixel, minlength=62 * 96).reshape(62, 96) == 1)
+    hits = np.concatenate([rays.pixel for rays in view.rays()])
+    inside = np.argwhere(np.bincount(hits, minlength=62 * 96).reshape(62, 96) == 1)
     origins, directions = distorted.rays(inside[:, ::-1] + 0.5)
     points = origins - directions * (origins[:, :1] / directions[:, :1])
     expected = (100 + points @ [0, 2.0, -1.0]) / np.pi
@@ -81,3 +85,29 @@ def test_supersampling_converges_at_the_rim() -> None:
     fine = relit_image(radiosity, mesh, camera(), supersample=16)
     errors = [np.abs(relit_image(radiosity, mesh, camera(), supersample=s) - fine).mean() for s in (1, 4)]
     assert errors[1] < errors[0] / 4
+
+
+def test_a_view_keeps_its_matrix_and_not_its_rays() -> None:
+    """Expected: bit for bit the matrix of all rays at once; what is kept is far smaller than the rays."""
+    view = ViewOfMesh(camera(), trimesh.creation.icosphere(subdivisions=2, radius=20), Boundary(1.3))
+    bands = list(view.rays())
+    pixel, triangle, barycentric = (
+        np.concatenate([getattr(b, n) for b in bands]) for n in ("pixel", "triangle", "barycentric")
+    )
+    share = (np.concatenate([view.weight(b) for b in bands])[:, None] * barycentric).ravel()
+    at = np.repeat(pixel, 3), view.mesh.faces[triangle].ravel()
+    whole = sparse.csr_matrix((share, at), shape=view.matrix.shape)
+    for name in ("data", "indices", "indptr"):
+        np.testing.assert_array_equal(getattr(view.matrix, name), getattr(whole, name))
+    assert len(bands) > 2
+    assert set(vars(view)) == {f.name for f in fields(view)} | {"matrix"}
+
+
+def test_moments_and_flux_come_from_one_integration(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, asked = on_mesh.hat_moments, []
+    monkeypatch.setattr(on_mesh, "hat_moments", lambda *a: asked.append(a) or found(*a))
+    lit = LightOnMesh(Uniform(), trimesh.creation.box(extents=(20, 30, 24)), Boundary(1.3), 2)
+    assert not asked
+    assert lit.flux.shape == lit.moments.shape == (2, 8)
+    assert lit.flux.sum() == pytest.approx(lit.moments.sum(), rel=1e-12)
+    assert len(asked) == 1
