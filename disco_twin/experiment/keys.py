@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from functools import cache
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,16 +18,17 @@ if TYPE_CHECKING:
     from disco_twin.scene.scene import Scene
 
 FLOORS = ("hw", "pipeline", "disco_twin")
+RENDERER = ("mitsuba", "drjit", "numpy", "scipy")  # packages whose versions simulated light depends on
 
 
 def content_key(*parts: Any) -> str:
-    """SHA-256 over the parts: text, bytes, files (their content), or anything that JSON can hold, files in it too."""
+    """SHA-256 over the parts: bytes, files (their content), text (marked by "="), or what JSON can hold, files too."""
     digest = hashlib.sha256()
     for part in parts:
         if isinstance(part, Path | bytes):
             data = part.read_bytes() if isinstance(part, Path) else part
         else:
-            text = part if isinstance(part, str) else json.dumps(part, sort_keys=True, default=content_key)
+            text = f"={part}" if isinstance(part, str) else json.dumps(part, sort_keys=True, default=content_key)
             data = text.encode()
         digest.update(len(data).to_bytes(8, "little"))
         digest.update(data)
@@ -42,11 +44,13 @@ def identity(scene: Scene) -> str:
 
 @cache
 def code_key(*modules: str) -> str:
-    """Key of the source of these modules and of all that they import (see `import_closure`).
+    """Key of the source of these modules and of all that they import (see `import_closure`); of light, its `RENDERER`.
 
     Raises: InputError where a file of the project is no valid Python.
     """
-    return content_key(*(part for module in import_closure(*modules) for part in (module, _source(module))))
+    closure = import_closure(*modules)
+    versions = {name: version(name) for name in RENDERER if "disco_twin.light" in closure and find_spec(name)}
+    return content_key(*(part for module in closure for part in (module, _source(module))), versions)
 
 
 def import_closure(*modules: str) -> list[str]:

@@ -74,8 +74,8 @@ def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool
         write_atomically(folder.devices_record, path.read_bytes())
     real = None if file.simulated_cameras else file.sensor
     sensor = lars3_sensor(run.scene.rig) if real is None else real.sensor()
-    key = content_key(folder.identity, "devices")
-    scan_key = content_key(key, repr(sensor))  # the sensor may be corrected before the first image
+    key = content_key(folder.identity.encode(), b"devices")  # bytes: the key that earlier versions gave it
+    scan_key = content_key(key.encode(), repr(sensor).encode())  # the sensor may be corrected before the first image
     run.stage("scan", scan_key, lambda _: write_scan(experiment, folder.capture, sensor))
 
     def take_images(report: Report) -> None:

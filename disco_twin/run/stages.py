@@ -24,6 +24,7 @@ from hw.base.files import write_atomically, write_json
 from pipeline.capture.loop import Interrupted
 from pipeline.reconstruct.registry import known_methods, require_method
 from pipeline.records import StageFigures
+from pipeline.stream.files import IMAGES
 from pipeline.stream.stream import StreamReader
 
 log = logging.getLogger(__name__)
@@ -142,7 +143,7 @@ def drop_outdated(folder: RunFolder, stage: str, key: str) -> None:
     with folder.alone():
         old = [path for pattern in CONTINUED[stage] for path in folder.root.glob(pattern) if path.is_file()]
         if old:
-            log.warning("the simulation's code has changed: what it left of %s in %s is made again", stage, folder.root)
+            log.warning("the code or renderer has changed: what it left of %s in %s is made again", stage, folder.root)
         for path in old:
             path.unlink()
         write_atomically(marker, key.encode())
@@ -186,7 +187,10 @@ def truth_stages(run: Run) -> None:
 def pipeline_stage(run: Run) -> None:
     """Reconstruct and relight, in a process of its own that is given the capture and nothing of the truth."""
     done = run.folder.stages
-    capture = [done[name].key for name in ("scan", "targets", "capture") if name in done]
+    capture: list[Any] = [done[name].key for name in ("scan", "targets", "capture") if name in done]
+    if run.folder.taken_by_devices:  # by their content: they may be taken anew, or added to; journals hold checksums
+        found, own = sorted(run.folder.capture.rglob("*")), run.folder.capture
+        capture += [{str(path.relative_to(own)): path} for path in found if path.is_file() and path.name != IMAGES]
     key = run.key("pipeline", capture, pipeline_inputs(run.scene, run.methods))
     run.stage("pipeline", key, lambda _: reconstruct_apart(run.scene, run.folder, run.methods))
     for warning in load_results(run.folder).warnings:

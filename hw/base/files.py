@@ -7,12 +7,12 @@ import json
 import os
 import shutil
 import tempfile
-import zipfile
 import zlib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,6 @@ from numpy.typing import NDArray
 from hw.base.errors import DiscoError, InputError
 
 Arrays = dict[str, NDArray[Any]]
-DAMAGE = (  # what NumPy and zipfile raise where bytes of an archive are other ones
-    OSError, zipfile.BadZipFile, zlib.error, ValueError, EOFError, TypeError, AttributeError, RuntimeError,
-)  # fmt: skip
 
 
 @contextmanager
@@ -83,7 +80,7 @@ def load_arrays(
             return head, {name: data[name] for name in (data.files if names is None else names) if name != "head"}
     except FileNotFoundError as error:
         raise InputError("is missing", file=path, remedy=remedy) from error
-    except DAMAGE as error:
+    except (OSError, BadZipFile, zlib.error, ValueError, EOFError, TypeError, AttributeError, RuntimeError) as error:
         raise InputError("is damaged, or another kind of file", file=path, remedy=remedy) from error
     except KeyError as error:
         raise InputError(f"is damaged (it lacks {error})", file=path, remedy=remedy) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -45,6 +46,12 @@ run = begin_run(Path("scene.toml"), Path("out"), "full", "default", Console())
 capture_stages(run)
 truth_stages(run)
 """
+KEYS = """
+import json
+from disco_twin.experiment.keys import code_key
+from disco_twin.run.stages import CODE
+print(json.dumps({stage: code_key(*modules) for stage, modules in CODE.items()}))
+"""
 HALF = """
 
 _whole = mean_transmittance
@@ -63,13 +70,18 @@ def project(tmp_path: Path, repository: Path) -> Path:
     return tmp_path
 
 
+def run_in(project: Path, program: str) -> str:
+    """What a program prints that imports the copy."""
+    environment = os.environ | {"PYTHONPATH": str(project)}
+    command = [sys.executable, "-c", program]
+    end = subprocess.run(command, cwd=project, env=environment, capture_output=True, text=True, check=False)
+    assert end.returncode == 0, end.stderr
+    return end.stdout
+
+
 def stages_done(project: Path) -> set[str]:
     """Simulate in the copy; the stages that were not finished before."""
-    environment = os.environ | {"PYTHONPATH": str(project)}
-    program = [sys.executable, "-c", PROGRAM]
-    end = subprocess.run(program, cwd=project, env=environment, capture_output=True, text=True, check=False)
-    assert end.returncode == 0, end.stderr
-    return {line.split()[0] for line in end.stdout.splitlines() if " MiB" in line}
+    return {line.split()[0] for line in run_in(project, PROGRAM).splitlines() if " MiB" in line}
 
 
 def test_truth_is_computed_again_when_what_it_imports_has_changed_and_only_then(project: Path) -> None:
@@ -86,3 +98,20 @@ def test_truth_is_computed_again_when_what_it_imports_has_changed_and_only_then(
             file.write("CHANGED = True\n")
     assert stages_done(project) == set()
     assert (project / "out" / "capture" / "images.bin").stat() == captured
+
+
+def test_a_changed_function_is_in_the_keys_of_the_stages_that_depend_on_it(project: Path) -> None:
+    """By the keys of a stage's code alone, of which the stages' own are made."""
+    before = json.loads(run_in(project, KEYS))
+    for module, function, again in (
+        ("camera/lars3", "lars3_sensor", {"scan", "targets", "capture"}),
+        ("light/sources", "light_source", set(before) - {"targets", "pipeline"}),
+        ("light/references", "render_reference", {"references", "scores"}),
+    ):
+        with (project / "disco_twin" / f"{module}.py").open("a") as file:
+            file.write(
+                f"\n\n_whole = {function}\n\n\ndef {function}(*given, **named):\n    return _whole(*given, **named)\n"
+            )
+        after = json.loads(run_in(project, KEYS))
+        assert again == {stage for stage in before if before[stage] != after[stage]}
+        before = after

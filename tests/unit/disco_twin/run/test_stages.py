@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,34 @@ def test_changed_code_does_its_stages_again(
     after = keys_of(folder)
     assert set(before) == ALL
     assert {name for name in ALL if before[name] != after[name]} == again
+
+
+def test_another_renderer_makes_light_again(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stages, "code_key", code_key.__wrapped__)  # no cache
+    before = keys_of(folder)
+    for package in ("mitsuba", "drjit", "numpy", "scipy"):
+        with monkeypatch.context() as upgraded:
+            upgraded.setattr(keys, "version", lambda name, p=package: "99" if name == p else version(name))
+            after = keys_of(folder)
+        assert {name for name in ALL if before[name] != after[name]} == ALL - {"targets"}
+
+
+def test_the_pipeline_reads_what_devices_left(folder: RunFolder) -> None:
+    """A capture that was taken anew, and photographs of targets that were added, are reconstructed again."""
+    run = Recorded(sphere(), folder, folder.scene_file, ("default",), QUIET)
+
+    def key() -> str:
+        pipeline_stage(run)
+        return folder.stages["pipeline"].key
+
+    files = ("devices.toml", "plan.json", "journal.bin", "sensor.json", "scan.ply", "calibration/a/targets.json")
+    (folder.capture / "calibration" / "a").mkdir(parents=True)
+    found = []
+    for content in ("old", "new"):  # of one size
+        for name in files:
+            (folder.capture / name).write_text(content)
+            found.append(key())
+    assert len(set(found)) == len(found) and key() == key()
 
 
 def test_the_closure_holds_what_is_imported_in_functions_and_the_packages_on_the_way() -> None:
