@@ -144,7 +144,7 @@ def fit_intrinsics(corners: Sequence[F64 | None], board: F64, nominal: PinholeCa
     again = np.concatenate([every.value[:LENS], every.value[LENS:].reshape(-1, 6)[good].ravel()])
     boards = _Boards([seen[i] for i in used], board, nominal)
     fit = boards.fit(again, tolerance, start)
-    inverse = np.linalg.inv(fit.precision)[:LENS, :LENS]
+    inverse = fit.covariance[:LENS, :LENS]
     prior = fit.prior.precision[:LENS, :LENS]
     of_board = np.repeat(np.arange(len(used)), 2 * len(board))
     meat = fit.scatter(of_board, LENS, about_mean=True)[:LENS, :LENS] + prior

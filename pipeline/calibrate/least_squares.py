@@ -7,6 +7,7 @@ edges along an outline, and for weights that come from the model's own mean.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -16,6 +17,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from hw.base.arrays import F64, I64
+from hw.base.errors import DiscoError
+
+log = logging.getLogger(__name__)
 
 END = 1e-10  # relative change of the sum or of the unknowns: far below any error bar
 
@@ -84,10 +88,15 @@ class Linearised:
         """(P, P) inverse covariance of the unknowns, if the weights are the measurements' own and the prior holds."""
         return np.asarray(self.information + self.prior.precision)
 
+    @property
+    def covariance(self) -> F64:
+        """(P, P) inverse of `precision`. Raises: DiscoError where an unknown is free, or a value not finite."""
+        return _solved(self.precision, np.eye(len(self.value)))
+
     def step(self) -> F64:
-        """(P,) to the minimum of the linearised sum (Gauss and Newton)."""
+        """(P,) to the minimum of the linearised sum (Gauss and Newton). Raises: DiscoError as `covariance`."""
         pull = self.prior.precision @ (self.value - self.prior.mean)
-        return -np.asarray(np.linalg.solve(self.precision, self.jacobian.T @ (self.weight * self.residual) + pull))
+        return -_solved(self.precision, self.jacobian.T @ (self.weight * self.residual) + pull)
 
     def scatter(self, group: I64, parameters: int | None = None, about_mean: bool = False) -> F64:
         """(P, P) covariance of the gradient, from how it differs between groups of measurements that err together.
@@ -116,6 +125,8 @@ def minimise(
 
     residual: (P,) unknowns -> (K,); jacobian: unknowns -> (K, P), otherwise by central differences; loss: of the
     residuals, not of the prior
+
+    Raises: DiscoError where residuals at the start, or derivatives, are not finite.
     """
     derivative = jacobian or partial(_differences, residual)
     values, vectors = np.linalg.eigh(prior.precision)
@@ -126,7 +137,7 @@ def minimise(
         return np.concatenate([residual(x), root @ (x - prior.mean)])
 
     def derivatives(x: F64) -> F64:
-        return np.concatenate([derivative(x), root])
+        return _finite(np.concatenate([derivative(x), root]))
 
     def rho(squares: F64) -> F64:
         sizes, linear = np.split(squares, [len(squares) - len(root)])
@@ -135,10 +146,27 @@ def minimise(
         return np.concatenate([[cost, weight, np.zeros_like(cost)], of_prior], axis=1)
 
     given: Any = rho  # scipy's stubs expect more of it than scipy
+    _finite(rows(start))
     found = least_squares(rows, start, derivatives, loss=given, x_scale="jac", ftol=END, xtol=END, gtol=END)
+    if not found.success:
+        log.warning("a fit of %d unknowns was stopped after %d steps, before it converged", len(start), found.nfev)
     x = np.asarray(found.x, np.float64)
     misses = residual(x)
     return Linearised(x, misses, derivative(x), loss.weight(misses), prior)
+
+
+def _finite(values: F64) -> F64:
+    """The same. Raises: DiscoError where one is not finite."""
+    if not np.isfinite(values).all():
+        raise DiscoError("a fit meets values that are not finite. Remedy: check what was measured, and the nominal rig")
+    return values
+
+
+def _solved(matrix: F64, right: F64) -> F64:
+    try:
+        return _finite(np.asarray(np.linalg.solve(matrix, right), np.float64))
+    except np.linalg.LinAlgError as error:
+        raise DiscoError("a fit's measurements leave unknowns free. Remedy: measure more, or more varied") from error
 
 
 def _differences(residual: Callable[[F64], F64], x: F64) -> F64:

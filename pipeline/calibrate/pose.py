@@ -266,7 +266,7 @@ def _fine(
         step = fit.step()
         sweep, total = sweep.moved(step), total + step
     fit = replace(fit, residual=np.asarray(j @ step - rest, np.float64))
-    inverse, meat = np.linalg.inv(fit.precision), fit.scatter(sector)
+    inverse, meat = fit.covariance, fit.scatter(sector)
     for c in range(len(sweep.lenses)):
         common = sector // (SECTORS * len(sweep.angles)) == c
         push = j[common].T @ weight[common] * (COMMON_EDGE_PX / variance)

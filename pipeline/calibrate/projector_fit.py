@@ -205,7 +205,7 @@ def refine(
         value = fit.value
         if abs(scatter - before) < 1e-4 * scatter:
             break
-    inverse = np.linalg.inv(fit.precision)
+    inverse = fit.covariance
     covariance = inverse @ (fit.scatter(np.repeat(group, 2)) + prior.precision) @ inverse
     kept = fit.weight[::2] > 0
     return ProjectorFit(

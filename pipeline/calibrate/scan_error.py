@@ -44,7 +44,7 @@ def surface_error(fit: Linearised, length: F64, place: F64) -> SurfaceError:
     An error that is itself estimated, with n degrees of freedom, leaves Student's distribution: n / (n - 2) as wide.
     Where no two edges are near but not adjacent, nothing is known of it: zeros, and a warning.
     """
-    every, inverse = -(-len(place) // MOST_EDGES), np.linalg.inv(fit.precision)
+    every, inverse = -(-len(place) // MOST_EDGES), fit.covariance
     j, rest, length, place = fit.jacobian[::every], fit.residual[::every], length[::every], place[::every]
     weight = fit.weight[::every] * every
     apart = np.linalg.norm(place[:, None, :3] - place[None, :, :3], axis=2)

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import ast
 import difflib
+import inspect
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -36,10 +38,20 @@ class Method:
     name: str
     module: str
     function: str
-    about: str = ""
-    reads: str = "footprint"
-    baseline: bool = False
-    colour: str | None = None
+    about: str
+    reads: str
+    baseline: bool
+    colour: str | None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not re.fullmatch("[a-z0-9_-]+", self.name):
+            raise ValueError(f"the name {self.name!r} is not of a-z, 0-9, _ and -: files are named after it")
+        if not isinstance(self.about, str) or not isinstance(self.baseline, bool):
+            raise ValueError("about is text, baseline True or False")
+        if self.reads not in READS:
+            raise ValueError(f"reads={self.reads!r} is none of {', '.join(READS)}")
+        if self.colour is not None and not re.fullmatch("#[0-9a-fA-F]{6}", str(self.colour)):
+            raise ValueError(f"colour={self.colour!r} is not #rrggbb")
 
     def load(self) -> Callable[..., Any]:
         """The function, from its module."""
@@ -57,13 +69,13 @@ def method(
 def known_methods() -> Mapping[str, Method]:
     """All methods of the package by name, the default first.
 
-    Raises: InputError for a file that is not valid Python, a decorator whose arguments are not written out, or a name
-    that is taken.
+    Raises: InputError for a file that is not valid Python, a decorator whose arguments are wrong or not written out, or
+    a name that is taken.
     """
     found: dict[str, Method] = {}
     for module, file in _modules():
-        text = file.read_text(encoding="utf-8")
-        if "@method(" in text:
+        text = file.read_bytes()
+        if re.search(rb"^@.*\bmethod\b", text, re.MULTILINE):
             for one in _declared(module, file, text):
                 if one.name in found:
                     raise InputError(
@@ -82,29 +94,29 @@ def _modules() -> Iterable[tuple[str, Path]]:
                 yield ".".join(["pipeline.reconstruct", *file.relative_to(root).with_suffix("").parts]), file
 
 
-def _declared(module: str, file: Path, text: str) -> Iterable[Method]:
+def _declared(module: str, file: Path, text: bytes) -> Iterable[Method]:
     try:
-        tree = ast.parse(text)
-    except SyntaxError as error:
-        raise InputError(
-            f"is not valid Python, line {error.lineno} ({error.msg})", file=file, remedy="correct it"
-        ) from error
-    for node in tree.body:
-        for mark in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
-            if isinstance(mark, ast.Call) and isinstance(mark.func, ast.Name) and mark.func.id == "method":
-                assert isinstance(node, ast.FunctionDef)
-                try:
-                    (name,) = map(ast.literal_eval, mark.args)
-                    options = {word.arg or "**": ast.literal_eval(word.value) for word in mark.keywords}
-                    declared = Method(name, module, node.name, **options)
-                    if declared.reads not in READS:
-                        raise ValueError(f"reads={declared.reads!r} is none of {', '.join(READS)}")
-                    yield declared
-                except (ValueError, TypeError) as error:
-                    raise InputError(
-                        f"cannot be read, line {mark.lineno} ({error})", file=file, key="@method",
-                        remedy='write it as @method("name", about="one line", reads="footprint", baseline=False)',
-                    ) from error  # fmt: skip
+        tree = ast.parse(text, file.name)
+    except (SyntaxError, ValueError) as error:  # ValueError: null bytes
+        raise InputError(f"is not valid Python: {error}", file=file, remedy="correct it") from error
+    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
+    for node in functions:
+        for mark in node.decorator_list:
+            called = mark.func if isinstance(mark, ast.Call) else mark
+            if "method" not in (getattr(called, "id", None), getattr(called, "attr", None)):
+                continue
+            try:
+                if not isinstance(mark, ast.Call):
+                    raise ValueError("its arguments are missing")
+                options = {word.arg or "**": ast.literal_eval(word.value) for word in mark.keywords}
+                given = inspect.signature(method).bind(*map(ast.literal_eval, mark.args), **options)
+                given.apply_defaults()
+                yield Method(module=module, function=node.name, **given.arguments)
+            except (ValueError, TypeError) as error:
+                raise InputError(
+                    f"cannot be read, line {mark.lineno} ({error})", file=file, key="@method",
+                    remedy='write it as @method("name", about="one line", reads="footprint", baseline=False)',
+                ) from error  # fmt: skip
 
 
 def require_method(name: str) -> str:

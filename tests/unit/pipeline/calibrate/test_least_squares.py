@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from hw.base.errors import DiscoError
+from pipeline.calibrate import least_squares
 from pipeline.calibrate.least_squares import Huber, Linearised, Prior, minimise
 
 F64 = NDArray[np.float64]
@@ -90,3 +94,37 @@ def test_groups_that_err_together_count_as_one() -> None:
     inverse = np.linalg.inv(fit.precision)
     variance = (inverse @ fit.scatter(group) @ inverse)[0, 0]
     assert variance == pytest.approx(level.var(ddof=1) / 10, rel=1e-12)
+
+
+def test_values_that_are_not_finite_are_refused() -> None:
+    j = np.eye(2)
+    for residual, jacobian in ((lambda x: x * np.nan, lambda x: j), (lambda x: x, lambda x: j * np.nan)):
+        with pytest.raises(DiscoError, match="not finite"):
+            minimise(residual, np.ones(2), PRIOR, jacobian)
+    with pytest.raises(DiscoError, match="not finite"):
+        Linearised(np.ones(2), np.array([1.0, np.nan]), j, np.ones(2), PRIOR).step()
+
+
+def test_a_free_unknown_is_refused() -> None:
+    free = Prior.independent(np.zeros(2), np.array([1.0, np.inf]))
+    fit = Linearised(np.ones(2), np.ones(3), np.outer(np.ones(3), [1.0, 0.0]), np.ones(3), free)
+    for refuse in (fit.step, lambda: fit.covariance):
+        with pytest.raises(DiscoError, match="unknowns free"):
+            refuse()
+
+
+def test_the_covariance_is_the_precisions_inverse() -> None:
+    j = np.random.default_rng(2).standard_normal((6, 2))
+    fit = Linearised(np.ones(2), np.ones(6), j, np.ones(6), PRIOR)
+    np.testing.assert_array_equal(fit.covariance, np.linalg.inv(fit.precision))
+
+
+def test_a_fit_that_does_not_converge_is_reported(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    measured = seen(0)
+    minimise(lambda x: (circle(x) - measured).ravel(), PRIOR.mean, PRIOR)
+    assert not caplog.text
+    monkeypatch.setattr(least_squares, "least_squares", partial(least_squares.least_squares, max_nfev=2))
+    minimise(lambda x: (circle(x) - measured).ravel(), PRIOR.mean, PRIOR)
+    assert "2 unknowns was stopped after 2 steps" in caplog.text

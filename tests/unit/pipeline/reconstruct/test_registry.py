@@ -52,18 +52,35 @@ def test_a_new_file_is_a_new_method(room: Path) -> None:
     assert [term.kind for term in model.terms] == ["lambertian"]
 
 
+@pytest.mark.parametrize("mark", ["registry.method", "pipeline.reconstruct.registry.method"])
+def test_the_decorator_may_be_named_through_its_module(mark: str, room: Path) -> None:
+    (room / "grey.py").write_text(MINE.replace("@method", f"@{mark}"))
+    assert known_methods()["grey"].about == "the mean albedo"
+
+
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
         ('"grey"', '"dipole"', "registered in pipeline.reconstruct.baselines.dipole, too"),
         ('about="the mean albedo"', "about=text", "cannot be read, line 5"),
-        ('about="the mean albedo"', 'reads="nearest"', "reads='nearest' is none of footprint, bilinear"),
+        ('colour="#123456"', 'reads="nearest"', "reads='nearest' is none of footprint, bilinear"),
         ('about="the mean albedo"', "shiny=True", "cannot be read"),
-        ("def grey(samples):", "def grey(samples)", "is not valid Python, line 6"),
+        ("def grey(samples):", "def grey(samples)", "is not valid Python.*line 6"),
+        (', about="the mean albedo"', "", "line 5 .missing a required"),
+        ('"grey"', "3", "line 5 .the name 3 is not of a-z"),
+        ('"grey"', '"../grey"', "line 5 .the name '../grey' is not of a-z"),
+        ('about="the mean albedo"', "about=3", "line 5 .about is text"),
+        ('colour="#123456"', 'baseline="no"', "line 5 .about is text, baseline True or False"),
+        ('colour="#123456"', "reads=[]", r"line 5 .reads=\[\] is none of"),
+        ('colour="#123456"', 'colour="grey"', "line 5 .colour='grey' is not #rrggbb"),
+        ('"grey", about="the mean albedo", colour="#123456"', '"grey", "the mean albedo"', "line 5 .too many"),
+        ('("grey", about="the mean albedo", colour="#123456")', "", "line 5 .its arguments are missing"),
+        ("mean", "m\xe9an", "is not valid Python.*utf-8"),
+        ("mean", "m\0an", "is not valid Python.*null bytes"),
     ],
 )
 def test_a_file_that_declares_its_method_wrongly(old: str, new: str, expected: str, room: Path) -> None:
-    (room / "grey.py").write_text(MINE.replace(old, new))
+    (room / "grey.py").write_text(MINE.replace(old, new), encoding="latin-1")
     with pytest.raises(InputError, match=expected) as caught:
         known_methods()
     assert "grey.py" in str(caught.value)
