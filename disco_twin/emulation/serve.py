@@ -28,19 +28,19 @@ POLL_S, IDLE_S = 0.001, 0.02  # while an answer is on its way, and otherwise
 class PtyPort:
     """A pseudo-terminal with a name of its own: a link in a folder. `fd` is what is read and written, and watched."""
 
-    def __init__(self, line: Cable, link: Path) -> None:
-        self.line, self.link = line, link
+    def __init__(self, cable: Cable, link: Path) -> None:
+        self.cable, self.link = cable, link
         self.fd, self._slave = pty.openpty()  # the slave stays open: without it the master fails between two users
         tty.setraw(self._slave)
         os.set_blocking(self.fd, False)
         link.unlink(missing_ok=True)
         link.symlink_to(os.ttyname(self._slave))
         self.url, self.source = str(link), self.fd
-        line.opened()
+        cable.opened()
 
     def ready(self, fd: int, selector: selectors.BaseSelector) -> None:
         """Bytes from the user."""
-        self.line.receive(os.read(self.fd, 4096))
+        self.cable.receive(os.read(self.fd, 4096))
 
     def close(self) -> None:
         """Unplug: the user's reads and writes fail from now on."""
@@ -53,8 +53,8 @@ class PtyPort:
 class TcpPort:
     """A port of 127.0.0.1; one user at a time. `source` is watched for users; `fd` is -1 while nobody is connected."""
 
-    def __init__(self, line: Cable) -> None:
-        self.line = line
+    def __init__(self, cable: Cable) -> None:
+        self.cable = cable
         self._server = socket.create_server(("127.0.0.1", 0))
         self.source = self._server.fileno()
         self._user: socket.socket | None = None
@@ -69,7 +69,7 @@ class TcpPort:
             user.setblocking(False)
             self._user, self.fd = user, user.fileno()
             selector.register(user, selectors.EVENT_READ, self)
-            self.line.opened()
+            self.cable.opened()
             return
         try:
             data = os.read(fd, 4096)
@@ -77,7 +77,7 @@ class TcpPort:
             log.debug("%s: %s", self.url, error)
             data = b""
         if data:
-            self.line.receive(data)
+            self.cable.receive(data)
         else:
             self._hang_up(selector)
 
@@ -85,7 +85,7 @@ class TcpPort:
         if self._user is not None:
             selector.unregister(self._user)
             self._user.close()
-            self.line.closed()
+            self.cable.closed()
         self._user, self.fd = None, -1
 
     def close(self) -> None:
@@ -97,17 +97,17 @@ class TcpPort:
 
 
 class Server:
-    """Serves lines between `__enter__` and `__exit__`; `urls` by name. `folder`: of the terminals, None for TCP."""
+    """Serves cables between `__enter__` and `__exit__`; `urls` by name. `folder`: of the terminals, None for TCP."""
 
-    def __init__(self, lines: Mapping[str, Cable], folder: Path | None) -> None:
-        self._lines, self._folder = dict(lines), folder
+    def __init__(self, cables: Mapping[str, Cable], folder: Path | None) -> None:
+        self._cables, self._folder = dict(cables), folder
         self._ports: dict[str, PtyPort | TcpPort] = {}
         self._selector = selectors.DefaultSelector()
         self._lock, self._end = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._serve, name="emulated devices", daemon=True)
 
     def __enter__(self) -> Self:
-        for name in self._lines:
+        for name in self._cables:
             self.plug(name)
         self._thread.start()
         return self
@@ -127,9 +127,9 @@ class Server:
     def plug(self, name: str) -> None:
         """Plug a device in; a terminal keeps its link's name, a TCP port gets a new number."""
         with self._lock:
-            line = self._lines[name]
-            line.plug()
-            port = TcpPort(line) if self._folder is None else PtyPort(line, self._folder / name)
+            cable = self._cables[name]
+            cable.plug()
+            port = TcpPort(cable) if self._folder is None else PtyPort(cable, self._folder / name)
             self._selector.register(port.source, selectors.EVENT_READ, port)
             self._ports[name] = port
 
@@ -140,7 +140,7 @@ class Server:
             for key in [k for k in self._selector.get_map().values() if k.data is port]:
                 self._selector.unregister(key.fileobj)
             port.close()
-            self._lines[name].unplug()
+            self._cables[name].unplug()
 
     def _serve(self) -> None:
         while not self._end.is_set():
@@ -152,17 +152,17 @@ class Server:
                         key.data.ready(key.fd, self._selector)
                 for port_name, port in self._ports.items():
                     if port.fd >= 0:
-                        self._send(self._lines[port_name], port.fd)
+                        self._send(self._cables[port_name], port.fd)
 
     def _pause(self) -> float:
         with self._lock:
-            coming = any(line.next_arrival() < math.inf for line in self._lines.values())
+            coming = any(cable.next_arrival() < math.inf for cable in self._cables.values())
         return POLL_S if coming else IDLE_S
 
-    def _send(self, line: Cable, fd: int) -> None:
-        data = line.deliver(4096, 0.0)
+    def _send(self, cable: Cable, fd: int) -> None:
+        data = cable.deliver(4096, 0.0)
         if data:
             try:
                 os.write(fd, data)
-            except (BlockingIOError, ConnectionError) as error:  # nobody reads: lost, as on a real line
+            except (BlockingIOError, ConnectionError) as error:  # nobody reads: lost, as on a real cable
                 log.debug("%d bytes lost: %s", len(data), error)

@@ -1,1 +1,1 @@
-"""Emulated devices: what they do (pure state machines with an injected clock), their lines, the bench they stand on."""
+"""Emulated devices: what they do (pure state machines with an injected clock), and the cables they hang on."""

@@ -108,7 +108,7 @@ def broken_by(message: bytes, at: int) -> Fault:
 
 
 class Cable:
-    """A device on its line. Faults are queued: each befalls one answer, or one write of the computer."""
+    """A device on its cable. Faults are queued: each befalls one answer, or one write of the computer."""
 
     def __init__(self, firmware: Firmware, clock: Clock) -> None:
         self.firmware, self.clock = firmware, clock

@@ -90,7 +90,7 @@ def _light(clock: Clock, board: Board, laser: OmicronLaser) -> Iterator[Callable
     In the end the laser is closed first, which one that does not answer draws out for seconds, then the lines are shut.
     """
 
-    def go_dark() -> None:
+    def darken_both() -> None:
         darken(clock, board, [laser])
 
     def shut() -> None:
@@ -99,9 +99,9 @@ def _light(clock: Clock, board: Board, laser: OmicronLaser) -> Iterator[Callable
 
     with _then(shut), _using(laser):
         try:
-            yield go_dark
+            yield darken_both
         except BaseException:
-            go_dark()
+            darken_both()
             raise
 
 
@@ -259,8 +259,8 @@ def _test_laser(connect: Connector, board: Board, index: int) -> str:
     The gate is shut whenever a laser that is on is asked for something: one that falls silent is asked for seconds.
     """
     file, device = connect.file, connect.file.lasers[index]
-    with _metering(connect) as meter, _light(connect.clock, board, laser := connect.omicron(index)) as go_dark:
-        verified = VerifiedBoard(board, connect.clock, [entry.gate_line for entry in file.lasers], go_dark)
+    with _metering(connect) as meter, _light(connect.clock, board, laser := connect.omicron(index)) as darken_both:
+        verified = VerifiedBoard(board, connect.clock, [entry.gate_line for entry in file.lasers], darken_both)
         verified.require_lines()
         verified.aim(*file.board.centre)
         (reading,) = begin_emission(connect.clock, file, verified, {index: laser})

@@ -26,7 +26,7 @@ SETTLE_S = 0.005  # of the galvos, after the DAC has taken both values
 class VerifiedBoard:
     """A board whose lines are all low, the commands that it gets from then on, and whether it still obeys them.
 
-    darken: tells every light to go out, without waiting for an answer
+    darken: commands every light to go out, without waiting for an answer
     """
 
     def __init__(self, board: Board, clock: Clock, gate_lines: Sequence[int], darken: Callable[[], None]) -> None:
@@ -34,8 +34,8 @@ class VerifiedBoard:
         self._gates = sum(1 << line for line in gate_lines)
         self._pattern = 0
         self._opening = False  # a gate is just being opened
-        self._aim, self._aimed = (0, 0), False  # where the mirrors were told to stand; whether that is certain
-        self.distrusted = False  # an answer was lost while a gate was open, and the lasers were told to go off
+        self._aim, self._aimed = (0, 0), False  # where the mirrors were sent; whether that is certain
+        self.distrusted = False  # an answer was lost while a gate was open, and the lasers were commanded off
         board.when_lost(self._lost)
 
     def _lost(self) -> None:
@@ -95,7 +95,7 @@ class VerifiedBoard:
             raise DeviceFault("board", "the mirror board", problem, "check its cable, then repeat the command")
 
     def open_gate(self, line: int) -> None:
-        """Open a gate, being certain that the mirrors stand where they were told to. Raises: DeviceFault."""
+        """Open a gate, being certain that the mirrors stand where they were sent. Raises: DeviceFault."""
         self._require_trust()
         for _ in range(ATTEMPTS):
             if not self._aimed:

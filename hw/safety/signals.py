@@ -19,7 +19,7 @@ ENDING = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT
 
 @dataclass(eq=False)
 class Interruption:
-    """`stopped`: the program was told to end. Once `ignoring`, nothing interrupts any more."""
+    """`stopped`: the program was asked to end. Once `ignoring`, nothing interrupts any more."""
 
     stopped: bool = False
     ignoring: bool = False
@@ -41,7 +41,7 @@ class _Program:
 
 
 _program = _Program()
-_heeded: list[Interruption] = []  # of the blocks that the program is in
+_obeyed: list[Interruption] = []  # of the blocks that the program is in
 
 
 @contextmanager
@@ -53,11 +53,11 @@ def interruptible() -> Iterator[Interruption]:
         with _handled_by(interruption.handle, caught):
             if caught:
                 raise caught[0]
-            _heeded.append(interruption)
+            _obeyed.append(interruption)
             yield interruption
     finally:
-        if interruption in _heeded:
-            _heeded.remove(interruption)
+        if interruption in _obeyed:
+            _obeyed.remove(interruption)
         if caught:
             raise caught[0]
 
@@ -77,7 +77,7 @@ def raise_if_interrupted() -> None:
 
     To be called before each thing that takes long or lets light out.
     """
-    if threading.current_thread() is threading.main_thread() and any(block.stopped for block in _heeded):
+    if threading.current_thread() is threading.main_thread() and any(block.stopped for block in _obeyed):
         raise KeyboardInterrupt
 
 

@@ -1,6 +1,6 @@
-"""The calibration file: all that the pipeline knows of a rig, each figure with its uncertainty.
+"""The calibration file: all that the pipeline has found of a rig, each figure with its uncertainty.
 
-Written from the nominal rig (`nominal_calibration`) or from measurements; readers cannot tell except by `source`.
+Written from the nominal rig (`nominal_calibration`) or from measurements; only `source` shows which.
 Everything is in the object frame (turntable frame at angle 0), mm and radians. A view is a pair of a camera and a
 turntable angle, cameras outermost: view = camera * n_angles + angle.
 """

@@ -181,12 +181,12 @@ def _start(seen: F64, time: F64) -> tuple[F64, F64]:
     best = np.inf
     values, light = KNOTS, np.ones(len(seen))
     for power in POWERS:
-        told = np.where(usable, np.clip(seen, 1e-4, 1.0) ** power / time, np.nan)
+        shown = np.where(usable, np.clip(seen, 1e-4, 1.0) ** power / time, np.nan)
         some = usable.sum(axis=1) >= 2
-        relative = np.nanstd(told[some], axis=1) / np.nanmean(told[some], axis=1)
+        relative = np.nanstd(shown[some], axis=1) / np.nanmean(shown[some], axis=1)
         spread = float(np.median(relative)) if len(relative) else 0.0
         if spread < best:
-            # The longest exposure that is not clipped tells most; where all are, or none shows anything, a guess.
+            # The longest exposure that is not clipped shows most; where all are, or none shows anything, a guess.
             last = np.where(usable.any(axis=1), np.argmax(np.where(usable, time, 0.0), axis=1), np.argmin(time))
             level = np.clip(np.take_along_axis(seen, last[:, None], axis=1)[:, 0], 1e-4, 1.0) ** power / time[last]
             best, light = spread, np.asarray(level, np.float64)
@@ -196,10 +196,10 @@ def _start(seen: F64, time: F64) -> tuple[F64, F64]:
 
 def _require_greys(seen: F64) -> None:
     """Refuse a bracket in which hardly any pixel shows light that is not clipped in two exposures or more."""
-    told = int((((seen > 0.01) & (seen < FULL)).sum(axis=1) >= 2).sum())
-    if told < LEAST:
+    shown = int((((seen > 0.01) & (seen < FULL)).sum(axis=1) >= 2).sum())
+    if shown < LEAST:
         raise InputError(
-            f"the exposures do not cover the response: {told} of {len(seen)} pixels are neither dark nor clipped in "
+            f"the exposures do not cover the response: {shown} of {len(seen)} pixels are neither dark nor clipped in "
             "two of them",
             key="bracket",
             allowed=f"{LEAST} or more",

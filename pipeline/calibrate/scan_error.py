@@ -2,8 +2,8 @@
 
 A scanner errs alike over some millimetres; edges err each for itself. Both variances follow from two quadratic forms of
 what a fit leaves: its squares, and its products between places that are near but not adjacent (Rao 1971, variance
-components). Over which length it errs alike, the likelihood tells. The fit takes a part of the errors for motion; the
-forms' expectations take that into account.
+components). The length over which it errs alike follows from the likelihood. The fit takes a part of the errors for
+motion; the forms' expectations take that into account.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pipeline.calibrate.least_squares import Linearised
 log = logging.getLogger(__name__)
 
 LENGTHS_MM = 5.0, 10.0, 20.0  # over which a scanner may err alike, a Gaussian correlation; the likeliest counts
-FACTORS = 4.0 ** np.arange(-2, 4)  # of the patches' variance, tried to tell how likely a length is
+FACTORS = 4.0 ** np.arange(-2, 4)  # of the patches' variance, tried for the likelihood of a length
 NEAR_MM = 2.0  # places that are nearer share an edge's own error
 MOST_EDGES = 1200
 LEAST_FREEDOM = 3.0  # with fewer Student's factor grows without bound; three times the variance was enough for 2 to 3
@@ -65,7 +65,7 @@ def surface_error(fit: Linearised, length: F64, place: F64) -> SurfaceError:
             best = found if best is None or found.likelihood > best.likelihood else best
     if best is None:
         log.warning(
-            "no two edges of the silhouettes lie %g to %g mm apart: they do not tell how far the scan is off over "
+            "no two edges of the silhouettes lie %g to %g mm apart: they do not show how far the scan is off over "
             "whole patches, and poses are stated without it",
             NEAR_MM,
             LENGTHS_MM[-1],

@@ -1,6 +1,6 @@
 """The lasers' own readings, taken in the dark before every view, as a table beside the stream: `lasers.csv`.
 
-A photodiode behind the gate sees what reaches the object; the laser's own reading tells whether a change of that came
+A photodiode behind the gate sees what reaches the object; the laser's own reading shows whether a change of that came
 from the laser. The table explains images and is no part of them: a capture is whole without it.
 """
 

@@ -12,7 +12,7 @@ from pipeline.capture.laser_log import DRIFT_SHARE, drifts, read_lasers
 from pipeline.stream.stream import CorruptImage, StreamReader
 
 SIGNIFICANT = 5.0  # standard deviations: a pixel that shows light
-DARK_PIXELS = 20  # a spot with fewer significant pixels tells nothing
+DARK_PIXELS = 20  # a spot with fewer significant pixels shows nothing
 
 
 @dataclass(frozen=True)
