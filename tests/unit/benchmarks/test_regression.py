@@ -33,6 +33,8 @@ def test_an_error_is_too_large_beyond_its_limit_whatever_its_sign() -> None:
     assert not too_large({name: 1.1 * value for name, value in FIGURES.items()}, limits, False)
     assert set(too_large({"pose/a": 4.1, "relit/b": 1.1}, limits, False)) == set(FIGURES)
     assert set(too_large({"pose/a": float("nan"), "relit/b": -0.5}, limits, False)) == {"pose/a"}
+    assert set(too_large({"pose/a": 0.0}, limits, True)) == {"relit/b"}  # what is not there is too large
+    assert not too_large({"pose/a": 0.0}, limits, True, partly=True)
 
 
 def test_limits_cover_what_kernels_do_and_refuse_what_would_hide_a_tenth() -> None:
