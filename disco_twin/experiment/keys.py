@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,8 +49,15 @@ def code_key(*modules: str) -> str:
     Raises: InputError where a file of the project is no valid Python.
     """
     closure = import_closure(*modules)
-    versions = {name: version(name) for name in RENDERER if "disco_twin.light" in closure and find_spec(name)}
+    versions = {name: _version(name) for name in RENDERER if "disco_twin.light" in closure}
     return content_key(*(part for module in closure for part in (module, _source(module))), versions)
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:  # a machine without the renderer
+        return None
 
 
 def import_closure(*modules: str) -> list[str]:
