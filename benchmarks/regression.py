@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -105,6 +106,17 @@ def fingerprint(folder: RunFolder) -> str:
     for path in (*sorted(folder.capture.glob("**/images.bin")), folder.capture / "scan.ply"):
         digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def processor() -> str:
+    """The processor's name, family, model and stepping, on which the rounding of photons' paths depends; elsewhere than
+    on Linux its architecture.
+    """
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().split("\n\n")[0].splitlines() if info.is_file() else []
+    known = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+    parts = [known[key] for key in ("model name", "cpu family", "model", "stepping") if key in known]
+    return " ".join(parts) or platform.machine()
 
 
 # Perturbations ------------------------------------------------------------------------------------------------------
@@ -332,6 +344,7 @@ def report(
     return {
         "command": "python -m benchmarks regression --json tests/regression/figures.json",
         "fingerprint": key,
+        "processor": processor(),
         "fresh_captures": len(fresh),
         "repetitions": perturbations,
         "power": caught,
@@ -342,7 +355,7 @@ def report(
 
 
 def run(quick: bool = False) -> dict[str, Any]:
-    """{fingerprint, repetitions, power by stage, false_alarm_rate, figures: {name: `Limit`}, fresh: their figures}."""
+    """{fingerprint, repetitions, power by stage, false_alarm_rate, figures: {name: `Limit`}, fresh: their figures, ...}."""
     first = take_run(1, quick)
     true = load_true_run(first.experiment, first.folder)
     frozen = load_outputs(first.experiment, first.folder, true), true
