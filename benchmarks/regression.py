@@ -355,7 +355,7 @@ def report(
 
 
 def run(quick: bool = False) -> dict[str, Any]:
-    """{fingerprint, repetitions, power by stage, false_alarm_rate, figures: {name: `Limit`}, fresh: their figures, ...}."""
+    """The record of `report`, after captures, repetitions and perturbations; `quick`: two small fresh captures."""
     first = take_run(1, quick)
     true = load_true_run(first.experiment, first.folder)
     frozen = load_outputs(first.experiment, first.folder, true), true
