@@ -69,6 +69,7 @@ def emulate(
             with served(loaded.rig, loaded.seed, folder) as path:
                 said = f"devices are served; rig file: {path}   (Ctrl-C ends it)"
                 console.print(said, highlight=False, soft_wrap=True)
+                raise_if_interrupted()  # a signal while the line was printed may have been swallowed there
                 time.sleep(seconds)
         except KeyboardInterrupt:
             console.print("ended")
