@@ -26,8 +26,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from disco_twin.camera.lars3 import lars3_sensor
-from disco_twin.evaluate.budget import object_frames, true_calibration
 from disco_twin.evaluate.scores import load_model, load_relit, usable_score
+from disco_twin.evaluate.true_calibration import object_frames, true_calibration
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.references import reference_path
 from disco_twin.experiment.run_folder import RunFolder

@@ -32,9 +32,6 @@ FaultsOption = Annotated[
         help="All rig faults of 2004 on (the pipeline then calibrates from the rig's images) or off; else the scene's.",
     ),
 ]
-BudgetOption = Annotated[
-    bool, typer.Option("--budget", help="Reconstruct with parts of the calibration made true: what does each cost?")
-]
 MethodsOption = Annotated[
     str | None, typer.Option(help="`all`, or a list such as default,disco2004; left out: the scene's.")
 ]
@@ -153,20 +150,36 @@ def reference(scene: SceneFile, out: RunOut, profile: ProfileOption = "full") ->
 
 
 @app.command()
-def score(out: RunOut, methods: MethodsOption = None, budget: BudgetOption = False) -> None:
+def score(out: RunOut, methods: MethodsOption = None) -> None:
     """Score a finished run again and write its summary and report. Needs no renderer."""
-    from disco_twin.cli.tables import budget_table, score_table
+    from disco_twin.cli.tables import score_table
     from disco_twin.run.progress import run_log
     from disco_twin.run.stages import reopen_run, score_stages
 
     opened = reopen_run(out, methods, console)
     with naming(opened.scene_file), run_log(opened.folder.root / "run.log", console):
         console.print("", score_table(score_stages(opened), opened.methods), sep="\n")
-        if budget:
-            from disco_twin.evaluate.budget import score_budget
 
-            rows = score_budget(opened.experiment, opened.folder, opened.methods[0])
-            console.print("", budget_table(rows), sep="\n")
+
+@app.command()
+def budget(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The folder of a finished run.")],
+    methods: Annotated[str | None, typer.Option("--method", help="The method; left out: the scene's first.")] = None,
+) -> None:
+    """Show where a run's relighting error comes from: each part made exact in turn. Renders; minutes, kept in OUT."""
+    from disco_twin.cli.tables import budget_tables
+    from disco_twin.run.budget import make_budget
+    from disco_twin.run.progress import run_log
+    from disco_twin.run.stages import reopen_run
+
+    opened = reopen_run(out, methods, console)
+    with naming(opened.scene_file), run_log(opened.folder.root / "run.log", console):
+        made = make_budget(opened)
+    for table in budget_tables(made):
+        console.print("", table, sep="\n")
+    for what, why in made.left_out.items():
+        console.print(f"no row for {what}: {why}", highlight=False, soft_wrap=True)
+    console.print("Parts act on each other: what they cost need not add up in quadrature.", highlight=False)
 
 
 @app.command()

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
-from disco_twin.evaluate.summary import figure_or_dash, pooled, rms
+from disco_twin.evaluate.summary import figure_or_dash, pooled
 from pipeline.capture.quality import ViewQuality
+
+if TYPE_CHECKING:
+    from disco_twin.run.budget import Budget
 
 QUALITY = ("view", "camera", "deg", "images", "saturated", "lit", "range", "dark", "mW")
 
@@ -23,15 +26,17 @@ def score_table(summary: dict[str, Any], methods: Sequence[str]) -> Table:
     return table
 
 
-def budget_table(rows: Sequence[dict[str, Any]]) -> Table:
-    """nrmse by calibration and light."""
-    lights = list(dict.fromkeys(row["light"] for row in rows))
-    table = _table(("nrmse, calibration", *lights), "nrmse, calibration")
-    for name in dict.fromkeys(row["calibration"] for row in rows):
-        own = [row for row in rows if row["calibration"] == name]
-        kept = {x: [r["nrmse"] for r in own if r["light"] == x and r["nrmse"] is not None] for x in lights}
-        table.add_row(name, *(figure_or_dash(rms(kept[x]) if kept[x] else None) for x in lights))
-    return table
+def budget_tables(budget: Budget) -> tuple[Table, Table]:
+    """nrmse of every row, views together, and what each part costs, by light."""
+    from disco_twin.run.budget import COSTS, LEFT
+
+    lights = list(dict.fromkeys(row.light for row in budget.rows))
+    made, costs = (_table((name, *lights), name) for name in ("nrmse with", "what costs"))
+    for row in dict.fromkeys(row.row for row in budget.rows):
+        made.add_row(row, *(figure_or_dash(budget.nrmse(row, light)) for light in lights))
+    for part in (*COSTS, LEFT):
+        costs.add_row(part, *(figure_or_dash(budget.cost(part, light)) for light in lights))
+    return made, costs
 
 
 def quality_table(views: Sequence[ViewQuality]) -> Table:

@@ -38,6 +38,7 @@ CODE = {  # where the code of a stage begins: all that it imports is part of the
     "references": ("disco_twin.experiment.references",),
     "pipeline": ("pipeline.__main__", "pipeline.reconstruct"),  # methods are found in their files, not imported
     "scores": ("disco_twin.evaluate.scores",),
+    "budget": ("disco_twin.run.budget", "pipeline.reconstruct"),
 }
 CAPTURE = ("capture/images.bin", "capture/journal.bin", "capture/plan.json")
 TARGETS = ("capture/calibration/*/*", "capture/calibration/*/bracket/*")

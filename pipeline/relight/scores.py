@@ -98,6 +98,38 @@ def score_relit(image: ArrayLike, half_a: ArrayLike, half_b: ArrayLike, mask: Bo
 
 
 @dataclass(frozen=True)
+class HalvesScore:
+    """Of images that are themselves noisy, as two independent halves, against a reference. nrmse, nrmse_se: as in
+    `RelitScore`, with no image's noise in them.
+    """
+
+    nrmse: float
+    nrmse_se: float
+
+
+def score_halves(images: ArrayLike, halves: ArrayLike, mask: Bool) -> HalvesScore:
+    """nrmse^2 = <(I - A)(J - B)> / <A B> for halves I, J of the images and A, B of the reference.
+
+    images, halves: (2, L, H, W) in W/(mm^2 sr); mask: (H, W). With means m = (I + J - A - B) / 2 and half differences
+    d of the images and e of the reference, the product is m^2 - d^2 - e^2 once both ways to pair them are averaged; its
+    standard error is that of `score_relit`, with the noise d - e.
+
+    Raises: Unscorable as `score_relit`.
+    """
+    (i, j), (a, b) = (np.asarray(x, np.float64)[:, :, mask] for x in (images, halves))
+    if i.size == 0:
+        raise Unscorable("the mask holds no pixel")
+    denominator = float((a * b).sum())
+    if denominator <= 0:
+        raise Unscorable("the reference holds no light above its noise")
+    error, mean, d, e = (i + j - a - b) / 2, (a + b) / 2, (i - j) / 2, (a - b) / 2
+    nrmse2 = float((error**2 - d**2 - e**2).sum()) / denominator
+    noise = _block_sums(2 * (error * (e - d) + nrmse2 * mean * e), mask)
+    se2 = float(np.sqrt((noise**2).sum())) / denominator
+    return HalvesScore(signed_root(nrmse2), 0.5 * (signed_root(nrmse2 + se2) - signed_root(nrmse2 - se2)))
+
+
+@dataclass(frozen=True)
 class DecadeScore:
     """Of an R_d against the truth, over the entries whose truth lies in one decade below the peak.
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.stage_figures import StageOutputs, TrueRun, all_figures
 from disco_twin.camera.lars3 import lars3_sensor
-from disco_twin.evaluate.budget import true_calibration
+from disco_twin.evaluate.true_calibration import true_calibration
 from disco_twin.faults.actual_rig import actual_rig
 from disco_twin.light.balance import EnergyBalance
 from disco_twin.light.truth import Truth

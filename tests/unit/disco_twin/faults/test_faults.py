@@ -5,17 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
 from disco_twin.camera.lars3 import lars3_sensor
-from disco_twin.evaluate.budget import VARIANTS, score_budget, true_calibration
+from disco_twin.evaluate.true_calibration import VARIANTS, true_calibration
 from disco_twin.experiment.experiment import Experiment
-from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.faults.actual_rig import actual_rig
 from disco_twin.object.build import hat_basis
 from disco_twin.scene.scene import load_scene
-from hw.base.errors import InputError
 from hw.interface import Aim
 from pipeline.calibrate.calibration import nominal_calibration
 from pipeline.geometry.camera import pose_rows
@@ -88,12 +85,3 @@ def test_a_variant_keeps_beams_and_images_together() -> None:
         for j in range(3):
             np.testing.assert_allclose(made.projector(j).pose, same.projector(j).pose, atol=1e-9)
             np.testing.assert_allclose(made.view_camera(j).pose, same.view_camera(j).pose, atol=1e-9)
-
-
-def test_a_run_that_was_not_calibrated_has_no_budget(tmp_path: Path) -> None:
-    scene = load_scene(QUICK)
-    folder = RunFolder(tmp_path)
-    folder.work.mkdir()
-    nominal_calibration(scene.rig, lars3_sensor(scene.rig)).save(folder.work / "calibration.json")
-    with pytest.raises(InputError, match="--faults"):
-        score_budget(Experiment(scene), folder, "default")

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from disco_twin.camera.lars3 import lars3_sensor
-from disco_twin.evaluate.budget import true_calibration
+from disco_twin.evaluate.true_calibration import true_calibration
 from disco_twin.faults.actual_rig import actual_rig
 from disco_twin.faults.light_faults import LaserPower
 from disco_twin.scene.rig_schema import TwinRigConfig

@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
-from pipeline.relight.scores import BLOCK, score_reflectance, score_relit
+from pipeline.relight.scores import BLOCK, score_halves, score_reflectance, score_relit, signed_root
 
 F64 = NDArray[np.float64]
 SHAPE = (3, 40, 48)
@@ -146,3 +147,38 @@ def test_reflectance_entries_that_the_truth_does_not_know_are_left_out() -> None
     scores = score_reflectance(truth, truth, se, True)
     assert scores[0].entries > 5000
     assert sum(s.entries for s in scores[1:]) < 300  # the peak is a little below 1
+
+
+@pytest.mark.parametrize("error", [0.0, 0.03, 0.3])
+def test_noise_of_the_images_drops_out_as_well_with_an_honest_standard_error(error: float) -> None:
+    """Rationale: images that are estimates themselves, 30 % noise on both sides. Expected: nrmse^2 scatters about the
+    noiseless value with the standard error it states; images without noise have the score that `score_relit` gives.
+    """
+    rng = np.random.default_rng(5)
+    truth = reference(rng)
+    model = truth * (1 + error * rng.normal(0, 1, SHAPE))
+    exact = score_relit(model, truth, truth, MASK).nrmse2
+    z = []
+    for _ in range(300):
+        i, j, a, b = (x + 0.3 * truth * rng.normal(0, 1, SHAPE) for x in (model, model, truth, truth))
+        score = score_halves(np.stack([i, j]), np.stack([a, b]), MASK)
+        z.append((signed_square(score.nrmse) - exact) / nrmse2_se(score.nrmse, score.nrmse_se))
+    assert abs(np.mean(z)) < 4 / np.sqrt(len(z))
+    assert np.std(z) == pytest.approx(1, abs=0.25)
+    alone = score_relit(model, a, b, MASK)
+    assert score_halves(np.stack([model, model]), np.stack([a, b]), MASK).nrmse == pytest.approx(alone.nrmse)
+    assert score_halves(np.stack([model, model]), np.stack([a, b]), MASK).nrmse_se == pytest.approx(alone.nrmse_se)
+
+
+def signed_square(x: float) -> float:
+    return x * abs(x)
+
+
+def nrmse2_se(nrmse: float, se: float) -> float:
+    """The standard error of nrmse^2 that `se` was made from."""
+
+    def stated(se2: float) -> float:
+        square = signed_square(nrmse)
+        return 0.5 * (signed_root(square + se2) - signed_root(square - se2)) - se
+
+    return float(brentq(stated, 0.0, 100.0))

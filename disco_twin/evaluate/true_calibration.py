@@ -1,34 +1,23 @@
-"""What each part of the calibration costs: the same capture reconstructed with parts of the calibration made true.
+"""The calibration with parts of it made true: what the error budget replaces, and what figures of stages compare with.
 
-`disco-twin score --budget`. Poses and projector are measured in one frame at each turntable angle, that of the scan as
-its silhouettes were understood, which stands turned against the object. Where one of the two is made true, the other
-keeps its relation to the cameras: otherwise beams and images would not meet on the object, which is no error of either.
-The truth goes to the pipeline here on purpose, into folders of the twin's own, and into no score of the run.
+Poses and projector are measured in one frame at each turntable angle, that of the scan as its silhouettes were
+understood, which stands turned against the object. Where one of the two is made true, the other keeps its relation to
+the cameras: otherwise beams and images would not meet on the object, which is no error of either.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from disco_twin.camera.lens import Glare
-from disco_twin.evaluate.scores import score_relit_images
-from disco_twin.experiment.experiment import Experiment
-from disco_twin.experiment.pipeline_process import reconstruct_apart
-from disco_twin.experiment.run_folder import RunFolder
-from disco_twin.faults.actual_rig import ActualRig, actual_rig
+from disco_twin.faults.actual_rig import ActualRig
 from disco_twin.scene.rig_schema import TwinRigConfig
 from hw.base.arrays import F64
-from hw.base.errors import InputError
-from hw.base.files import write_json
-from pipeline.calibrate.calibration import Calibration, ProjectorCalibration, nominal_calibration, pair
+from pipeline.calibrate.calibration import Calibration, ProjectorCalibration, pair
 from pipeline.geometry.camera import pose_rows
-
-FORMAT_VERSION = 1
-RECORD = "budget.json"
 
 
 def true_calibration(rig: TwinRigConfig, actual: ActualRig, nominal: Calibration) -> Calibration:
@@ -97,34 +86,10 @@ def _seen_from(projectors: Sequence[ProjectorCalibration], frames: Sequence[F64]
     return tuple(p.model_copy(update={"object_to_projector": x}) for p, x in zip(projectors, poses, strict=True))
 
 
+# By name: (as measured, true) -> the calibration with that part made true.
 VARIANTS: dict[str, Callable[[Calibration, Calibration], Calibration]] = {
     "true photometric": _photometric,
     "true pose": _pose,
     "true projector": _projector,
     "all true": lambda _, true: true,
 }
-
-
-def score_budget(experiment: Experiment, folder: RunFolder, method: str) -> list[dict[str, Any]]:
-    """Rows {calibration, light, view, nrmse, ...} of one method: as measured, uncalibrated, and each part made true."""
-    scene = experiment.scene
-    own = Calibration.load(folder.work / "calibration.json")
-    if own.source != "measured":
-        raise InputError(
-            "the calibration was not measured: nothing to replace by truth",
-            file=folder.work / "calibration.json",
-            remedy="disco-twin run SCENE --faults --out DIR",
-        )
-    nominal = nominal_calibration(scene.rig, own.sensor)
-    true = true_calibration(scene.rig, actual_rig(scene.rig, scene.seed), nominal)
-    rows = [{"calibration": "measured"} | row for row in score_relit_images(experiment, folder, (method,))]
-    wanted = {"nominal": nominal} | {name: make(own, true) for name, make in VARIANTS.items()}
-    for name, calibration in wanted.items():
-        variant = folder.variant(folder.twin / "budget" / name.replace(" ", "-"))
-        variant.work.mkdir(parents=True, exist_ok=True)
-        given = variant.root / "calibration.json"
-        calibration.save(given)
-        reconstruct_apart(scene, variant, (method,), given)
-        rows += [{"calibration": name} | row for row in score_relit_images(experiment, variant, (method,))]
-    write_json(folder.twin / RECORD, {"format_version": FORMAT_VERSION, "method": method, "rows": rows})
-    return rows

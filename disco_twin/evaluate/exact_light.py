@@ -1,0 +1,209 @@
+"""Images of an object whose light below the surface is exact, with diffuse or exact ends: what no model can beat.
+
+Eq. 2.1 of the thesis has two diffuse ends: light enters as if it came from all around, and leaves by F_t / pi whatever
+the way it came. Here photons walk between ends that are exact, diffuse, or averaged over the scan's hat functions; the
+differences to the references are the errors of each assumption alone. Every result is two independent halves, so that
+scores hold no noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from scipy.sparse import linalg as sparse_linalg
+
+from disco_twin.experiment.experiment import Experiment
+from disco_twin.object.mesh import hat_basis
+from hw.base.arrays import F64
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.fresnel import Boundary, mean_transmittance, transmittance
+from pipeline.geometry.mesh import RayMesh
+from pipeline.geometry.pixel_footprints import trace_pixels
+from pipeline.reconstruct.samples.spots import Spots
+from pipeline.relight.irradiance import hat_moments
+from pipeline.relight.lights import Light
+
+EDGES = np.array([0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0 + 1e-9])
+SUPERSAMPLE = 3
+SAMPLE_WALKS, REPLICATES = 30_000, 4  # of a spot's exact samples; those whose spread is their noise
+SPOTS_AT_ONCE = 25
+NEGLIGIBLE = 1e-6  # of a pattern's power
+
+
+@dataclass(frozen=True)
+class SeenRadiosity:
+    """A reference and the radiosity that should explain it. camera; reference: (L, H, W) W/(mm^2 sr), mean of both
+    halves; radiosity: (L, V) W/mm^2 on the mesh's vertices
+    """
+
+    camera: PinholeCamera
+    reference: F64
+    radiosity: F64
+
+
+class ExactLight:
+    """The object's light by photons. eta: the index that the ends assume; walks: photons of a light, both halves."""
+
+    def __init__(self, experiment: Experiment, eta: float, walks: int) -> None:
+        self.experiment, self.eta, self.walks = experiment, eta, walks
+        self.mesh, self.scan = experiment.object.mesh, experiment.scan
+        self.mean = mean_transmittance(eta)
+        self.areas = RayMesh.of(self.mesh).vertex_areas
+        self.basis = hat_basis(self.mesh, self.scan)
+
+    def power_of(self, light: Light) -> F64:
+        """(2, L, V_fine) W that leave at each vertex's hat function; the light enters as it does."""
+        from disco_twin.light.sources import light_source
+
+        transport = self.experiment.transport
+        traced = transport.trace(
+            lambda group: light_source(light, transport.radius, group), 2, max(1, self.walks // 2),
+            seed=self.experiment.seed(f"budget {light.name}"), deposit=True,
+        )  # fmt: skip
+        assert traced.deposits is not None
+        return traced.deposits
+
+    def entering(self, light: Light) -> F64:
+        """(L, V_fine) W/mm^2 whose transmitted share is the light's, if it came from all around: a diffuse entry."""
+        lasers = self.experiment.transport.lasers
+        return hat_moments(light, self.mesh, self.eta, lasers) / (self.areas * self.mean)
+
+    def entering_on_hats(self, light: Light, boundary: Boundary) -> F64:
+        """As `entering`, as a model on the scan knows it: projected onto the scan's hat functions."""
+        lasers = self.experiment.transport.lasers
+        moments = hat_moments(light, self.scan, boundary, lasers)
+        density = self.consistent(moments) / self.mean
+        return np.asarray((self.basis @ density.T).T)
+
+    def after_diffuse_entry(
+        self, name: str, density: F64, cameras: Sequence[PinholeCamera] = ()
+    ) -> tuple[F64 | None, F64]:
+        """What leaves when light of (L, V_fine) W/mm^2 enters from all around; negative parts count as such.
+
+        (2, C, L, H, W) radiance in W/(mm^2 sr) in the cameras, which are of one size, and (2, L, V_fine) W.
+        """
+        from disco_twin.light.sources import HatSource
+
+        transport, lasers = self.experiment.transport, len(density)
+        share = density / np.maximum(np.abs(density).max(axis=1, keepdims=True), 1e-300)
+        rows = [0] if np.allclose(share, share[:1], rtol=1e-3, atol=1e-6) else list(range(lasers))
+        factor = np.abs(density).max(axis=1) / np.maximum(np.abs(density[rows]).max(axis=1), 1e-300)
+        hats, row_of, watts = [], [], []
+        for row in rows:
+            whole = float(np.abs(density[row]) @ self.areas)
+            for sign in (1.0, -1.0):
+                part = np.maximum(sign * density[row], 0.0)
+                power = float(part @ self.areas)
+                if power > NEGLIGIBLE * whole:
+                    hats.append(part)
+                    row_of.append(row)
+                    watts.append(sign * power)
+        n = len(hats)
+        shape = (2, len(cameras), lasers, cameras[0].height, cameras[0].width) if cameras else None
+        images, power_out = None if shape is None else np.zeros(shape), np.zeros((2, lasers, len(self.areas)))
+        if not n:  # black light
+            return images, power_out
+        stacked = np.stack([*hats, *hats])
+        traced = transport.trace(
+            lambda group: HatSource(transport.vertices, transport.faces, stacked, len(group)), 2 * n,
+            max(1, self.walks // (2 * n)), seed=self.experiment.seed(f"budget {name}"), cameras=cameras, layers=2,
+            deposit=True,
+        )  # fmt: skip
+        assert traced.deposits is not None
+        for tag, (row, power) in enumerate(zip(row_of, watts, strict=True)):
+            for laser in range(lasers) if len(rows) == 1 else (row,):
+                for half in range(2):
+                    own, scale = tag + half * n, power * (factor[laser] if len(rows) == 1 else 1.0)
+                    power_out[half, laser] += scale * traced.deposits[own, laser]
+                    if images is not None and traced.images is not None:
+                        images[half, :, laser] += scale * traced.images[own, 0, :, laser]
+        return images, power_out
+
+    def spot_responses(self, spots: Spots) -> tuple[F64, F64]:
+        """(L, S, V) R_d in mm^-2 from beams that enter from all around to the scan's hat functions, and its variance
+        by the photons' noise; zeros for spots that are not used.
+        """
+        from disco_twin.light.importance import Splitting
+        from disco_twin.light.sources import HatSource
+
+        transport, fine = self.experiment.transport, self.mesh.subdivide()  # a footprint covers few triangles
+        vertices, faces = np.asarray(fine.vertices, np.float64), np.asarray(fine.faces, np.int64)
+        area, lasers = np.asarray(self.basis.T @ self.areas), transport.lasers
+        value, variance = np.zeros((2, lasers, len(spots.position), len(area)))
+        used = np.flatnonzero(spots.transmitted > 0)
+        for low in range(0, len(used), SPOTS_AT_ONCE):
+            some = used[low : low + SPOTS_AT_ONCE]
+            hats = np.repeat([_footprint(vertices, spots, spot) for spot in some], REPLICATES, axis=0)
+
+            def source(group: Sequence[int], hats: F64 = hats) -> HatSource:
+                return HatSource(vertices, faces, hats, len(group))
+
+            names = (some[:, None] * REPLICATES + np.arange(REPLICATES)).ravel().astype(np.uint32)
+            traced = transport.trace(
+                source, len(hats), SAMPLE_WALKS // REPLICATES, seed=self.experiment.seed("budget samples"),
+                streams=names, deposit=True, split=Splitting(np.repeat(spots.position[some], REPLICATES, axis=0)),
+            )  # fmt: skip
+            assert traced.deposits is not None
+            power = np.stack([(self.basis.T @ deposit.T).T for deposit in traced.deposits])
+            r = power.reshape(len(some), REPLICATES, lasers, -1) / (area * self.mean**2)
+            value[:, some] = np.moveaxis(r.mean(axis=1), 1, 0)
+            variance[:, some] = np.moveaxis(r.var(axis=1, ddof=1), 1, 0) / REPLICATES
+        return value, variance
+
+    # ---- the diffuse exit: B = exitance / Tbar, seen by F_t / pi
+
+    def radiosity(self, power: F64) -> F64:
+        """(..., V_fine) W/mm^2 on the fine mesh from (..., V_fine) W."""
+        return np.asarray(power / (self.areas * self.mean))
+
+    def radiosity_on_hats(self, power: F64, consistent: bool) -> F64:
+        """(..., V) W/mm^2 on the scan's vertices from (..., V_fine) W: mean over each hat, or projected onto them."""
+        moments = np.asarray((self.basis.T @ power.reshape(-1, power.shape[-1]).T).T)
+        if consistent:
+            out = self.consistent(moments)
+        else:
+            out = moments / (self.basis.T @ self.areas)
+        return np.asarray(out.reshape(*power.shape[:-1], -1) / self.mean)
+
+    def consistent(self, moments: F64) -> F64:
+        """(N, V) coefficients on the scan's hat functions whose moments are these (mass matrix)."""
+        solved = sparse_linalg.spsolve(RayMesh.of(self.scan).mass_matrix, moments.T)
+        return np.asarray(solved.reshape(len(self.scan.vertices), -1).T)
+
+
+def _footprint(vertices: F64, spots: Spots, spot: int) -> F64:
+    """(V,) 1 inside a beam where it meets the surface, 0 elsewhere."""
+    way = vertices - spots.position[spot]
+    along = way @ spots.direction[spot]
+    across2 = (way**2).sum(axis=1) - along**2
+    near = np.abs(along) < 4 * spots.beam_radius  # not where it would leave on the other side
+    inside = (across2 < spots.beam_radius**2) & near
+    if not inside.any():  # between the vertices
+        inside[np.argmin((way**2).sum(axis=1))] = True
+    return np.asarray(inside, np.float64)
+
+
+def best_curve(mesh: trimesh.Trimesh, eta: float, seen: Sequence[SeenRadiosity]) -> Boundary:
+    """The one curve of the view cosine that explains all these references best: an oracle, for floors alone."""
+    observed, expected = np.zeros(len(EDGES) - 1), np.zeros(len(EDGES) - 1)
+    for one in seen:
+        camera = one.camera
+        scale = 1.0 / max(float(one.reference.max()), 1e-300)  # all lights count alike
+        flat = one.reference.sum(axis=0).ravel() * scale
+        model = one.radiosity.sum(axis=0) * scale
+        for band in trace_pixels(mesh, camera, SUPERSAMPLE):
+            whole = np.bincount(band.pixel, minlength=flat.size)[band.pixel] == SUPERSAMPLE**2
+            use = np.flatnonzero(whole & (band.cosine > 0))
+            cosine = band.cosine[use]
+            at = np.searchsorted(EDGES, cosine, side="right") - 1
+            radiosity = (band.barycentric[use] * model[np.asarray(mesh.faces)[band.triangle[use]]]).sum(axis=1)
+            observed += np.bincount(at, flat[band.pixel[use]], len(observed))
+            expected += np.bincount(at, transmittance(cosine, eta) / np.pi * radiosity, len(expected))
+    known = np.flatnonzero(expected > 1e-3 * expected.max(initial=0.0))
+    if not len(known):
+        return Boundary(eta)
+    middle = 0.5 * (EDGES[known] + EDGES[known + 1])
+    return Boundary(eta, tuple(map(float, middle)), tuple(map(float, observed[known] / expected[known])))
