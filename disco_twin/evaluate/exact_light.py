@@ -56,9 +56,9 @@ class ExactLight:
 
     def power_of(self, light: Light) -> F64:
         """(2, L, V_fine) W that leave at each vertex's hat function; the light enters as it does."""
+        transport = self.experiment.transport  # starts the renderer, which the next module imports
         from disco_twin.light.sources import light_source
 
-        transport = self.experiment.transport
         traced = transport.trace(
             lambda group: light_source(light, transport.radius, group), 2, max(1, self.walks // 2),
             seed=self.experiment.seed(f"budget {light.name}"), deposit=True,
@@ -85,9 +85,9 @@ class ExactLight:
 
         (2, C, L, H, W) radiance in W/(mm^2 sr) in the cameras, which are of one size, and (2, L, V_fine) W.
         """
+        transport, lasers = self.experiment.transport, len(density)
         from disco_twin.light.sources import HatSource
 
-        transport, lasers = self.experiment.transport, len(density)
         share = density / np.maximum(np.abs(density).max(axis=1, keepdims=True), 1e-300)
         rows = [0] if np.allclose(share, share[:1], rtol=1e-3, atol=1e-6) else list(range(lasers))
         factor = np.abs(density).max(axis=1) / np.maximum(np.abs(density[rows]).max(axis=1), 1e-300)
@@ -126,10 +126,10 @@ class ExactLight:
         """(L, S, V) R_d in mm^-2 from beams that enter from all around to the scan's hat functions, and its variance
         by the photons' noise; zeros for spots that are not used.
         """
+        transport, fine = self.experiment.transport, self.mesh.subdivide()  # a footprint covers few triangles
         from disco_twin.light.importance import Splitting
         from disco_twin.light.sources import HatSource
 
-        transport, fine = self.experiment.transport, self.mesh.subdivide()  # a footprint covers few triangles
         vertices, faces = np.asarray(fine.vertices, np.float64), np.asarray(fine.faces, np.int64)
         area, lasers = np.asarray(self.basis.T @ self.areas), transport.lasers
         value, variance = np.zeros((2, lasers, len(spots.position), len(area)))

@@ -185,14 +185,19 @@ def truth_stages(run: Run) -> None:
     run.stage("references", run.key("references", keys, scene.simulation.reference_walks), render, "lights")
 
 
-def pipeline_stage(run: Run) -> None:
-    """Reconstruct and relight, in a process of its own that is given the capture and nothing of the truth."""
+def pipeline_key(run: Run, methods: Sequence[str]) -> str:
+    """Key of a reconstruction by these methods of the capture as it is now."""
     done = run.folder.stages
     capture: list[Any] = [done[name].key for name in ("scan", "targets", "capture") if name in done]
     if run.folder.taken_by_devices:  # by their content: they may be taken anew, or added to; journals hold checksums
         found, own = sorted(run.folder.capture.rglob("*")), run.folder.capture
         capture += [{str(path.relative_to(own)): path} for path in found if path.is_file() and path.name != IMAGES]
-    key = run.key("pipeline", capture, pipeline_inputs(run.scene, run.methods))
+    return run.key("pipeline", capture, pipeline_inputs(run.scene, methods))
+
+
+def pipeline_stage(run: Run) -> None:
+    """Reconstruct and relight, in a process of its own that is given the capture and nothing of the truth."""
+    key = pipeline_key(run, run.methods)
     run.stage("pipeline", key, lambda _: reconstruct_apart(run.scene, run.folder, run.methods))
     for warning in load_results(run.folder).warnings:
         log.warning("%s", warning)
@@ -216,6 +221,11 @@ def score_stages(run: Run) -> dict[str, Any]:
     if why := stale(run.scene, run.folder, run.methods):
         remedy = f"disco-twin reconstruct --out {run.folder.root} --methods {','.join(run.methods)}"
         raise InputError(why, file=run.folder.work, key="--methods", value=",".join(run.methods), remedy=remedy)
+    if done["pipeline"].key != pipeline_key(run, tuple(load_results(run.folder).methods)):
+        remedy = f"disco-twin reconstruct --out {run.folder.root}"
+        log.warning(
+            "the capture, or the pipeline's code, has changed since the latest reconstruct; `%s` repeats it", remedy
+        )
     if done["truth"].key != run.key("truth"):
         log.warning("the code of the ground truth has changed since it was computed; `%s` computes it again", again)
     key = run.key("scores", *(done[name].key for name in ("truth", "references", "pipeline")), list(run.methods))

@@ -22,7 +22,7 @@ from disco_twin.light.backend import activate
 from disco_twin.run import stages
 from disco_twin.run.progress import Report
 from disco_twin.run.stages import Run, capture_stages, drop_outdated, pipeline_stage, score_stages, truth_stages
-from pipeline.records import PipelineRecord
+from pipeline.records import MethodFigures, PipelineRecord
 
 
 class Scored(Exception):
@@ -116,6 +116,25 @@ def test_the_pipeline_reads_what_devices_left(folder: RunFolder) -> None:
             (folder.capture / name).write_text(content)
             found.append(key())
     assert len(set(found)) == len(found) and key() == key()
+
+
+def test_scores_notice_what_devices_took_since_the_reconstruction(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    made = {"default": MethodFigures(seconds=1.0, provenance={})}
+    done = PipelineRecord(format_version=1, stages=(), methods=made, capture={}, left_out=(), warnings=())
+    monkeypatch.setattr(stages, "load_results", lambda folder: done)
+    run = Recorded(sphere(), folder, folder.scene_file, ("default",), QUIET)
+    for name in ("devices.toml", "journal.bin"):
+        (folder.capture / name).write_text("old")
+    folder.stages |= {name: StageRecord(name, "", finished=True) for name in ("capture", "truth", "references")}
+    pipeline_stage(run)
+    for content, noticed in (("old", False), ("new", True)):
+        (folder.capture / "journal.bin").write_text(content)
+        caplog.clear()
+        with pytest.raises(Scored):
+            score_stages(run)
+        assert ("since the latest reconstruct" in caplog.text) is noticed
 
 
 def test_the_closure_holds_what_is_imported_in_functions_and_the_packages_on_the_way() -> None:
