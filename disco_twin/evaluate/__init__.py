@@ -1,1 +1,1 @@
-"""Scores against truth and references, the error budget, the simulation's noise, summary.json."""
+"""Scores against truth and references, what an error budget compares with, the simulation's noise, summary.json."""
