@@ -195,6 +195,7 @@ def plan(scene: SceneFile, profile: ProfileOption = "full") -> None:
         experiment = Experiment(load_scene(scene, profile))
         require_capturable(experiment)
         lines = predict(experiment, shipped_references(scene, experiment.scene.name))
+        lines += [("warning", line) for line in experiment.warnings]
     for name, value in lines:
         console.print(f"  {name:<12} {value}", highlight=False, soft_wrap=True)
 

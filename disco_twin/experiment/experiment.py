@@ -15,6 +15,7 @@ from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.nominal_rig import CameraConfig
 from pipeline.plan.plan import Plan, make_plan
+from pipeline.plan.visibility import warn_of_frame
 
 if TYPE_CHECKING:
     from disco_twin.light.transport import Transport
@@ -43,6 +44,19 @@ class Experiment:
     def plan(self) -> Plan:
         """Which images the capture consists of."""
         return make_plan(self.scene.rig, self.scan)
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """What is no error, but should be known before the capture: cameras that do not see the whole object."""
+        rig, angles = self.scene.rig, np.deg2rad(self.scene.rig.turntable_angles_deg)
+        lines = [
+            warn_of_frame(camera, self.scan, f"rig.cameras[{i}]", f"the camera {camera.name!r}", angles)
+            for i, camera in enumerate(rig.cameras)
+        ] + [
+            warn_of_frame(view, self.scan, f"relight.views[{i}]", f"the held-out view {view.name!r}")
+            for i, view in enumerate(self.scene.relight.views)
+        ]
+        return tuple(line for line in lines if line is not None)
 
     @cached_property
     def transport(self) -> Transport:

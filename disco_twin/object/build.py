@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Literal
 import trimesh
 
 from disco_twin.object import shapes
+from disco_twin.object.blend import blend
+from disco_twin.object.extrusion import extrusion
 from disco_twin.object.media import Medium, build_medium
 from disco_twin.object.mesh import check_size, hat_basis, read_mesh, remesh
 from disco_twin.object.scanner import scan_points
-from disco_twin.scene.object_schema import MOST_VERTICES, Box, MeshFile, Pebble, Shape, Sphere, Torus
+from disco_twin.scene.object_schema import MOST_VERTICES, Blend, Box, Extrusion, MeshFile, Pebble, Shape, Sphere, Torus
 from hw.base.errors import InputError
 from pipeline.geometry.surface_from_points import reconstruct_surface
 
@@ -70,6 +72,8 @@ def build_scan(scene: Scene, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         return reconstruct_surface(*scan_points(mesh, scene.seed), vertices)
     if isinstance(shape, Box):
         return shapes.box(shape, triangles=2 * vertices)  # keeps the edges sharp
+    if isinstance(shape, Extrusion):
+        return extrusion(shape, triangles=2 * vertices)
     return remesh(mesh, vertices)
 
 
@@ -85,5 +89,9 @@ def _mesh(shape: Shape) -> trimesh.Trimesh:
             mesh = shapes.box(shape)
         case Torus():
             mesh = shapes.torus(shape)
+        case Blend():
+            mesh = blend(shape)
+        case Extrusion():
+            mesh = extrusion(shape)
     check_size(mesh, "object.shape")
     return mesh

@@ -58,11 +58,13 @@ def collect(experiment: Experiment, folder: RunFolder, summary: dict[str, Any]) 
 def notes(experiment: Experiment) -> list[str]:
     """Conditions under which the figures hold."""
     if experiment.scene.rig.faults.deviation:
-        return ["The actual rig deviates from the nominal one; the pipeline is given the nominal one only."]
-    return [
-        "The rig's deviation is off: poses and projector are exactly the nominal ones, as a perfect calibration "
-        "would find them."
-    ]
+        rig = "The actual rig deviates from the nominal one; the pipeline is given the nominal one only."
+    else:
+        rig = (
+            "The rig's deviation is off: poses and projector are exactly the nominal ones, as a perfect calibration "
+            "would find them."
+        )
+    return [rig, *(f"{line[0].upper()}{line[1:]}." for line in experiment.warnings)]
 
 
 def impulses(rig: RigConfig, capture: Path, sensor: Sensor) -> tuple[list[list[Impulse]], list[str]]:

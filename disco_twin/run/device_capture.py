@@ -6,6 +6,7 @@ and no other rig continues them.
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,8 @@ from pipeline.stream.stream import StreamReader
 if TYPE_CHECKING:
     from disco_twin.run.progress import Report
     from disco_twin.run.stages import Run
+
+log = logging.getLogger(__name__)
 
 
 def open_rig_file(run: Run, path: Path, armed: bool) -> DevicesFile:
@@ -68,6 +71,8 @@ def _has_images(folder: Path) -> bool:
 def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool) -> None:
     """Scan and capture; continues where it was interrupted, if the rig is the same and has not moved since."""
     file, experiment, folder = open_rig_file(run, path, armed), run.experiment, run.folder
+    for warning in experiment.warnings:
+        log.warning("%s", warning)
     if logs is not None:
         require_folder(logs, "--logs")
     if not _has_images(folder.capture):  # what the images are begun with is kept

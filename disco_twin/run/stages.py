@@ -152,6 +152,8 @@ def drop_outdated(folder: RunFolder, stage: str, key: str) -> None:
 
 def capture_stages(run: Run) -> None:
     """Scan and capture by the twin. What devices have captured is left as it is. Raises: InputError if it is cut."""
+    for warning in run.experiment.warnings:
+        log.warning("%s", warning)
     if run.folder.taken_by_devices:
         with StreamReader(run.folder.capture) as stream:
             stream.require_complete()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -61,6 +62,36 @@ def require_in_sight(config: CameraConfig, mesh: trimesh.Trimesh, key: str, what
             allowed=f"at least {least:.2g} mm^2, the scan resolves no less",
             remedy="a shorter focal_length_mm, a farther position_mm, or another aim_mm",
         )
+
+
+def warn_of_frame(
+    config: CameraConfig, mesh: trimesh.Trimesh, key: str, what: str, angles_rad: Sequence[float] = (0.0,)
+) -> str | None:
+    """One line where a part of the object lies outside a camera's image at any of these turntable angles; else None.
+
+    That is no error: what one image lacks, others may show. `key`: the camera's table in the scene.
+    """
+    camera = PinholeCamera.from_config(config)
+    shares = np.array([_share_outside(camera.seen_from(turn(angle)), mesh) for angle in angles_rad])
+    cut = np.flatnonzero(shares > 0)
+    if not len(cut):
+        return None
+    worst = int(np.argmax(shares))
+    share = f"{100 * shares[worst]:.0f} %" if shares[worst] >= 0.01 else "less than 1 %"
+    others = f" (and at {len(cut) - 1} more)" if len(cut) > 1 else ""
+    return (
+        f"{what} does not see the whole object: at turntable angle {np.rad2deg(angles_rad[worst]):g} deg{others} "
+        f"{share} of its surface lies outside the image. Remedy: a shorter {key}.focal_length_mm, a farther "
+        "position_mm, or another aim_mm"
+    )
+
+
+def _share_outside(camera: PinholeCamera, mesh: trimesh.Trimesh) -> float:
+    """Share of the surface whose place in the image plane lies outside the image, whether it is hidden or not."""
+    place, depth = camera.project(np.asarray(mesh.vertices, float))
+    inside = (depth > 0) & ((place >= 0) & (place <= [camera.width, camera.height])).all(axis=1)  # NaN is outside
+    area = np.asarray(mesh.area_faces)
+    return float((~inside[mesh.faces]).mean(axis=1) @ area / area.sum())
 
 
 def _require_outside(position: Point, angle_rad: float, mesh: trimesh.Trimesh, key: str, what: str) -> None:

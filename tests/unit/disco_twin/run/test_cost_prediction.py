@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from scene_texts import GOOD
 
+from disco_twin.cli.app import main
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.references import shipped_references
 from disco_twin.run.cost_prediction import predict, simulation_seconds
@@ -68,3 +70,18 @@ def test_references_beside_the_scene_cost_nothing(experiment: Experiment, tmp_pa
     assert "minutes" in dict(predict(experiment, tmp_path))["references"]
     more = changed(experiment, reference_walks=100 * experiment.scene.simulation.reference_walks)
     assert "minutes" in dict(predict(more, shipped_references(SCENE, "quick")))["references"]
+
+
+def test_the_command_warns_of_cameras_that_do_not_see_the_whole_object(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Expected behaviour: a line a camera or view, and the scene is planned all the same."""
+    path = tmp_path / "scene.toml"
+    path.write_text(GOOD.replace("vertices = 642", "vertices = 162"))
+    with pytest.raises(SystemExit) as end:
+        main(["plan", str(path)])
+    assert end.value.code == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.split()[0] == "warning"]
+    assert len(lines) == 3
+    for line, name in zip(lines, ("rig.cameras[0]", "relight.views[0]", "relight.views[1]"), strict=True):
+        assert "does not see the whole object" in line and f"{name}.focal_length_mm" in line

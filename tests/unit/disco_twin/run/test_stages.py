@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -19,6 +20,7 @@ from disco_twin.experiment.keys import code_key, import_closure
 from disco_twin.experiment.run_folder import RunFolder, StageRecord
 from disco_twin.faults.actual_rig import actual_rig
 from disco_twin.light.backend import activate
+from disco_twin.report.collect import notes
 from disco_twin.run import stages
 from disco_twin.run.progress import Report
 from disco_twin.run.stages import Run, capture_stages, drop_outdated, pipeline_stage, score_stages, truth_stages
@@ -210,3 +212,31 @@ def test_stored_spots_belong_to_object_cameras_and_beam() -> None:
         key(sphere(faults={"deviation": True}), seed=1),
     ]
     assert len({key(same), *others}) == len(others) + 1
+
+
+def test_a_run_warns_of_cameras_that_do_not_see_the_whole_object(
+    folder: RunFolder, caplog: pytest.LogCaptureFixture
+) -> None:
+    """In `run`, in the report's notes; whole objects give neither."""
+    experiment = sphere()
+    with caplog.at_level(logging.WARNING):
+        capture_stages(Recorded(experiment, folder, folder.scene_file, ("default",), QUIET))
+    said = [record.getMessage() for record in caplog.records]
+    assert [line.split(" does not see the whole object")[0] for line in said] == [
+        "the camera 'a'",
+        "the held-out view 'b'",
+        "the held-out view 'c'",
+    ]
+    assert notes(experiment)[1:] == [f"T{line[1:]}." for line in said]
+    camera = experiment.scene.rig.cameras[0].model_copy(update={"focal_length_mm": 2.0})
+    scene = experiment.scene
+    wide = Experiment(
+        scene.model_copy(
+            update={
+                "rig": scene.rig.model_copy(update={"cameras": (camera,)}),
+                "relight": scene.relight.model_copy(update={"views": (camera, camera)}),
+            }
+        )
+    )
+    assert wide.warnings == ()
+    assert len(notes(wide)) == 1

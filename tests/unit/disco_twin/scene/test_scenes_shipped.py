@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from disco_twin.object.build import build_object, build_scan
+from disco_twin.object.build import TwinObject, build_object, build_scan
 from disco_twin.scene.scene import Scene, load_scene
 from pipeline.geometry.camera import PinholeCamera, turn
 from pipeline.geometry.nominal_rig import CameraConfig
+from pipeline.plan.plan import make_plan
 
 
 @pytest.fixture(scope="module")
@@ -75,3 +76,77 @@ def test_small_profile_keeps_field_of_view_and_object(quick: Scene, repository: 
         assert b.width * b.height * 4 == a.width * a.height
         assert b.width * b.pixel_pitch_um == pytest.approx(a.width * a.pixel_pitch_um)
     Scene.model_validate(small.model_dump())
+
+
+# The accuracy set --------------------------------------------------------------------------------------------------
+
+CHOOSE, SCORE = {"ring", "figure", "animal"}, {"bracket", "flower", "gourd", "column"}
+BEYOND_THE_FRAME = "column"
+
+
+@pytest.fixture(scope="module")
+def accuracy_set(repository: Path) -> dict[str, Scene]:
+    return {path.stem: load_scene(path) for path in sorted((repository / "scenes" / "accuracy").glob("*/*.toml"))}
+
+
+@pytest.fixture(scope="module")
+def accuracy_objects(accuracy_set: dict[str, Scene]) -> dict[str, TwinObject]:
+    return {name: build_object(scene) for name, scene in accuracy_set.items()}
+
+
+def test_the_accuracy_set_shares_no_object(repository: Path, accuracy_set: dict[str, Scene]) -> None:
+    for folder, names in (("choose", CHOOSE), ("score", SCORE)):
+        assert {path.stem for path in (repository / "scenes" / "accuracy" / folder).glob("*.toml")} == names
+    assert all(scene.name == name for name, scene in accuracy_set.items())
+    assert len({scene.seed for scene in accuracy_set.values()}) == len(accuracy_set)  # no two rigs err alike
+    shapes = {scene.object.shape.model_dump_json() for scene in accuracy_set.values()}
+    media = {scene.object.medium.model_dump_json() for scene in accuracy_set.values()}
+    assert len(shapes) == len(media) == len(accuracy_set)
+
+
+def test_the_accuracy_set_is_measured_alike(accuracy_set: dict[str, Scene], quick: Scene) -> None:
+    """The same rig with all its faults, the same lights and views, as many columns of truth as totals need."""
+    for scene in accuracy_set.values():
+        assert scene.rig == quick.rig
+        assert all(scene.rig.faults.model_dump().values())
+        assert scene.relight == quick.relight
+        assert scene.simulation.truth_columns == 48
+
+
+def test_the_accuracy_set_spans_what_is_measured(
+    accuracy_set: dict[str, Scene], accuracy_objects: dict[str, TwinObject]
+) -> None:
+    """Indices, roughness, asymmetry, and sizes in transport mean free paths (of the ball of the same volume)."""
+    eta = [scene.object.boundary.eta for scene in accuracy_set.values()]
+    alpha = [scene.object.boundary.alpha for scene in accuracy_set.values()]
+    g = [scene.object.medium.g for scene in accuracy_set.values()]
+    assert (min(eta), max(eta), min(alpha), max(alpha), min(g), max(g)) == (1.3, 1.6, 0.05, 0.4, 0.0, 0.8)
+    size = {}
+    for name, scene in accuracy_set.items():
+        mesh, base = accuracy_objects[name].mesh, scene.object.medium.base
+        assert base.kind == "homogeneous"
+        radius = (3 * mesh.volume / (4 * np.pi)) ** (1 / 3)
+        size[name] = radius * float(np.max(base.sigma_t_per_mm)) * (1 - float(np.max(scene.object.medium.g)))
+        assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
+        assert 15_000 < len(mesh.faces) < 20_000
+        assert mesh.euler_number == (0 if name in ("ring", "bracket") else 2)
+    assert 7.5 < min(size.values()) < 9
+    assert 55 < max(size.values()) < 65
+    features = {name: bool(scene.object.medium.features) for name, scene in accuracy_set.items()}
+    assert {name for name, has in features.items() if not has} == {"ring", "bracket", "flower"}
+
+
+def test_the_accuracy_set_can_be_captured(
+    accuracy_set: dict[str, Scene], accuracy_objects: dict[str, TwinObject]
+) -> None:
+    """Every object is planned on its own mesh, and fits all images with a margin; one is longer than they are."""
+    for name, scene in accuracy_set.items():
+        mesh = accuracy_objects[name].mesh
+        assert len(make_plan(scene.rig, mesh).spots) == 300
+        margins = []
+        for camera, angle in [(c, a) for c in scene.rig.cameras for a in scene.rig.turntable_angles_deg] + [
+            (view, 0.0) for view in scene.relight.views
+        ]:
+            pixels, _ = PinholeCamera.from_config(camera).seen_from(turn(np.deg2rad(angle))).project(mesh.vertices)
+            margins.append(min(pixels.min(), (np.array([camera.width, camera.height]) - pixels).min()))
+        assert (max(margins) < -10) if name == BEYOND_THE_FRAME else (min(margins) > 1), (name, margins)
