@@ -48,7 +48,8 @@ class Experiment:
     @cached_property
     def warnings(self) -> tuple[str, ...]:
         """What is no error, but should be known before the capture: cameras that do not see the whole object."""
-        rig, angles = self.scene.rig, np.deg2rad(self.scene.rig.turntable_angles_deg)
+        rig = self.scene.rig
+        angles = [float(angle) for angle in np.deg2rad(rig.turntable_angles_deg)]
         lines = [
             warn_of_frame(camera, self.scan, f"rig.cameras[{i}]", f"the camera {camera.name!r}", angles)
             for i, camera in enumerate(rig.cameras)
