@@ -19,6 +19,8 @@ from typing import Any
 from hw.base.resources import measured, usable_cores
 
 REGISTRY = {
+    "accuracy": "benchmarks.accuracy",
+    "accuracy-choose": "benchmarks.accuracy_choose",
     "calibrate": "benchmarks.calibrate",
     "faults": "benchmarks.faults",
     "irradiance": "benchmarks.irradiance",
@@ -61,13 +63,18 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def readable(record: dict[str, Any]) -> Iterator[str]:
-    """A table: the plain figures, a line for every row of a list, then one for every point of a curve."""
+    """A table: the plain figures, a line for every row of a list, for every object and method, for every point of a
+    curve.
+    """
     for key, value in record.items():
         if not isinstance(value, list | dict):
             yield f"{key:<24} {_short(value)}"
     for rows in (value for key, value in record.items() if isinstance(value, list) and key != "curves"):
         for row in rows:
             yield "  ".join(f"{name} {_short(value)}" for name, value in row.items())
+    for name, methods in record.get("objects", {}).items():
+        for method, lights in methods.items():
+            yield f"{name:<10} {method:<11} " + "  ".join(f"{light} {_short(x)}" for light, x in lights.items())
     for curve in record.get("curves", []):
         for point in curve["points"]:
             settings = ", ".join(f"{k} {v}" for k, v in point.get("settings", {}).items())

@@ -97,6 +97,29 @@ def score_relit(image: ArrayLike, half_a: ArrayLike, half_b: ArrayLike, mask: Bo
     )
 
 
+def paired_difference(
+    image: ArrayLike, other: ArrayLike, half_a: ArrayLike, half_b: ArrayLike, mask: Bool
+) -> tuple[float, float]:
+    """nrmse2 of `image` less that of `other` against the same reference, and its standard error from the reference's
+    noise; negative where `image` is better.
+
+    image, other, half_a, half_b: (L, H, W) linear radiance in W/(mm^2 sr); mask: (H, W), the object's pixels.
+
+    The halves' product drops out, (I - A)(I - B) - (J - A)(J - B) = (I - J)(I + J - A - B): only where the two images
+    differ does noise count, so that images that err alike are told apart far better than either score is known. What
+    is left is the noise of the mean M of both halves; by the symmetry under exchange of A and B (see `score_relit`) a
+    block's sum of (I - J + r M)(A - B) has mean zero and its variance, with r the difference itself, which stands for
+    the noise of the denominator. Raises: Unscorable.
+    """
+    i, j, a, b = (np.asarray(x, np.float64)[:, mask] for x in (image, other, half_a, half_b))
+    denominator = float((a * b).sum())
+    if i.size == 0 or denominator <= 0:
+        raise Unscorable("the mask holds no pixel, or the reference no light above its noise")
+    difference = float(((i - j) * (i + j - a - b)).sum()) / denominator
+    noise = _block_sums((i - j + difference * (a + b) / 2) * (a - b), mask)
+    return difference, float(np.sqrt((noise**2).sum())) / denominator
+
+
 @dataclass(frozen=True)
 class HalvesScore:
     """Of images that are themselves noisy, as two independent halves, against a reference. nrmse, nrmse_se: as in
