@@ -80,8 +80,8 @@ def test_small_profile_keeps_field_of_view_and_object(quick: Scene, repository: 
 
 # The accuracy set --------------------------------------------------------------------------------------------------
 
-CHOOSE, SCORE = {"ring", "figure", "animal"}, {"bracket", "flower", "gourd", "column"}
-BEYOND_THE_FRAME = "column"
+CHOOSE, SCORE = {"ring", "figure", "animal"}, {"bracket", "flower", "gourd", "newt"}
+BEYOND_THE_FRAME = "newt"
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +139,7 @@ def test_the_accuracy_set_spans_what_is_measured(
 def test_the_accuracy_set_can_be_captured(
     accuracy_set: dict[str, Scene], accuracy_objects: dict[str, TwinObject]
 ) -> None:
-    """Every object is planned on its own mesh, and fits all images with a margin; one is longer than they are."""
+    """Every object is planned on its own mesh, and fits all images with a margin; one is longer than most of them."""
     for name, scene in accuracy_set.items():
         mesh = accuracy_objects[name].mesh
         assert len(make_plan(scene.rig, mesh).spots) == 300
@@ -149,4 +149,4 @@ def test_the_accuracy_set_can_be_captured(
         ]:
             pixels, _ = PinholeCamera.from_config(camera).seen_from(turn(np.deg2rad(angle))).project(mesh.vertices)
             margins.append(min(pixels.min(), (np.array([camera.width, camera.height]) - pixels).min()))
-        assert (max(margins) < -10) if name == BEYOND_THE_FRAME else (min(margins) > 1), (name, margins)
+        assert (min(margins) < -10) if name == BEYOND_THE_FRAME else (min(margins) > 1), (name, margins)
