@@ -113,7 +113,7 @@ def paired_rows(opened: Run) -> list[dict[str, Any]]:
     The errors of the two views are taken as independent.
     """
     folder, relight = opened.folder, opened.scene.relight
-    masks = {view.name: opened.experiment.object_mask(view) for view in relight.views}
+    masks = {view.name: opened.experiment.object_pixels(view).inner for view in relight.views}
     rows = []
     for light in relight.lights:
         for baseline in (method for method in opened.methods if method != METHOD):

@@ -101,7 +101,7 @@ def bounds(samples: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def fingerprint(folder: RunFolder) -> str:
-    """Of the images, the scan and the true R_d: equal where the same photons were simulated."""
+    """Of the images, the scan and the truth: equal where the same photons were simulated."""
     digest = hashlib.blake2b(Truth.load(folder.twin / "truth.npz").mean.tobytes(), digest_size=16)
     for path in (*sorted(folder.capture.glob("**/images.bin")), folder.capture / "scan.ply"):
         digest.update(path.read_bytes())
@@ -173,12 +173,12 @@ def _scaled_samples(outputs: StageOutputs, size: float, rng: Generator) -> Stage
 
 
 def _noisy_entries(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
-    entries = outputs.reflectance
-    return replace(outputs, reflectance=entries * np.exp(size * rng.standard_normal(entries.shape)))
+    entries = outputs.exitance
+    return replace(outputs, exitance=entries * np.exp(size * rng.standard_normal(entries.shape)))
 
 
 def _scaled_entries(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
-    return replace(outputs, reflectance=outputs.reflectance * np.exp(_sign(rng) * size))
+    return replace(outputs, exitance=outputs.exitance * np.exp(_sign(rng) * size))
 
 
 def _noisy_images(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:

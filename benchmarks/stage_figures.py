@@ -6,8 +6,8 @@ figure that grew names the stage that made it grow:
     pose        mm, where surface points appear in the images, seen by the measured cameras and by the actual ones
     projector   mm, distance of the aimed beam's axis from the place that the actual projector hits
     spots       mm, distance of each spot's place on the scan from where the beam met the object
-    samples     log10, measured R_d between spots and the vertices whose R_d is known, by decade below the peak
-    completion  log10, all entries of those vertices by decade, and each column's total
+    samples     log10, measured R_d between spots and the vertices whose truth is known, by decade below the peak
+    completion  log10, all entries of those vertices by decade; column totals, over lit and over unlit vertices
     relit       nrmse and energy of each relit image
 
 Pose and projector are compared in the object frame as the silhouettes were understood at each turntable angle; that
@@ -26,7 +26,9 @@ import trimesh
 from numpy.typing import NDArray
 
 from disco_twin.camera.lars3 import lars3_sensor
+from disco_twin.evaluate.entries import score_entries
 from disco_twin.evaluate.scores import load_model, load_relit, usable_score
+from disco_twin.evaluate.totals import lit_vertices, score_totals
 from disco_twin.evaluate.true_calibration import object_frames, true_calibration
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.references import reference_path
@@ -35,12 +37,12 @@ from disco_twin.faults.actual_rig import ActualRig, actual_rig
 from disco_twin.light.references import LAYERS, load_reference
 from disco_twin.light.truth import Truth
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
+from pipeline.geometry.fresnel import mean_transmittance
 from pipeline.geometry.mesh import RayMesh, read_scan
 from pipeline.plan.plan import Plan
 from pipeline.reconstruct.samples.distances import beam_footprints
 from pipeline.reconstruct.samples.samples_file import load_samples
 from pipeline.reconstruct.samples.spots import Spots
-from pipeline.relight.scores import score_reflectance
 
 F64 = NDArray[np.float64]
 DECADES = 3  # below the peak; fainter samples are noise
@@ -50,21 +52,23 @@ DECADES = 3  # below the peak; fainter samples are noise
 class StageOutputs:
     """What the stages of one method's run left. `images`: (L, H, W) by (light, view), W/(mm^2 sr).
 
-    spots: as located on the scan; values: (L, S, V) samples in mm^-2, NaN where not observed;
-    reflectance: (L, n, V) mm^-2, the completed model's rows of the vertices in `TrueRun.truth`.
+    spots: as located on the scan; values: (L, S, V) samples in mm^-2, NaN where not observed, times Tbar^2 of the
+    boundary that they were divided by; exitance: (L, n, V) mm^-2, Tbar^2 R_d of the completed model for the vertices in
+    `TrueRun.truth`; lit: (n,) whether a spot lies in their triangles.
     """
 
     calibration: Calibration
     spots: Spots
     values: F64
-    reflectance: F64
+    exitance: F64
+    lit: NDArray[np.bool_]
     images: dict[tuple[str, str], NDArray[np.floating[Any]]]
 
 
 @dataclass(frozen=True)
 class TrueRun:
     """What outputs are compared with. hits: (S, 3) mm, where beams met the object, NaN where they missed it;
-    halves: (2, L, H, W) of the reference by (light, view); masks: (H, W) the object's pixels by view.
+    halves: (2, L, H, W) of the reference by (light, view); masks: (H, W) by view, the object's pixels without its rim.
     """
 
     scan: trimesh.Trimesh
@@ -94,21 +98,22 @@ def load_true_run(experiment: Experiment, folder: RunFolder) -> TrueRun:
         _hits(experiment, actual),
         Truth.load(folder.twin / "truth.npz"),
         {key: reference.halves[:, layer] for key, reference in references.items()},
-        {view.name: experiment.object_mask(view) for view in views},
+        {view.name: experiment.object_pixels(view).inner for view in views},
     )
 
 
 def load_outputs(experiment: Experiment, folder: RunFolder, true: TrueRun, method: str = "default") -> StageOutputs:
     """What a run's stages left in WORK; the method's model has to state R_d."""
-    columns = load_model(folder, method).reflectance_columns(true.truth.columns)
+    columns = load_model(folder, method).exitance_columns(true.truth.columns)
     assert columns is not None, f"{method} states no R_d"
     samples = load_samples(folder.work / "samples.npz")
     relight = experiment.scene.relight
     return StageOutputs(
         Calibration.load(folder.work / "calibration.json"),
         samples.spots,
-        samples.values.astype(np.float64),
+        samples.values.astype(np.float64) * mean_transmittance(samples.eta) ** 2,
         np.asarray(columns.mean, np.float64),
+        lit_vertices(samples)[true.truth.columns],
         {(x.name, v.name): load_relit(folder, method, x.name, v) for x in relight.lights for v in relight.views},
     )
 
@@ -152,7 +157,7 @@ def spot_figures(outputs: StageOutputs, true: TrueRun) -> dict[str, float]:
 
 
 def sample_figures(outputs: StageOutputs, true: TrueRun) -> dict[str, float]:
-    """R_d is reciprocal: that from a spot to a vertex is the true column of the vertex, at the spot's footprint."""
+    """By reciprocity light from a spot to a vertex is the true column of the vertex, at the spot's footprint."""
     truth, footprint = true.truth, beam_footprints(true.scan, outputs.spots)
     estimate = outputs.values[:, :, truth.columns].transpose(0, 2, 1)  # (L, n, S)
     mean = np.stack([(footprint @ column.T).T for column in truth.mean])
@@ -161,14 +166,16 @@ def sample_figures(outputs: StageOutputs, true: TrueRun) -> dict[str, float]:
 
 
 def completion_figures(outputs: StageOutputs, true: TrueRun) -> dict[str, float]:
-    """Entries by decade; a column's total is the light that leaves anywhere per light that enters at its vertex."""
-    truth, reflectance = true.truth, outputs.reflectance
-    figures = _by_decade("completion", reflectance, truth.mean, truth.standard_error)
-    totals = np.log10((reflectance @ truth.area) / (truth.mean @ truth.area))
-    return figures | {
-        "completion/totals log10 rmse": _rms([totals]),
-        "completion/totals log10 bias": float(totals.mean()),
-    }
+    """Entries by decade; a column's total is the light that leaves anywhere per light that arrives over its vertex."""
+    truth, exitance = true.truth, outputs.exitance
+    figures = _by_decade("completion", exitance, truth.mean, truth.standard_error)
+    for name, chosen in {"lit": outputs.lit, "unlit": ~outputs.lit}.items():
+        score = score_totals(exitance @ truth.area, truth, chosen)
+        bias = [math.log10(x) if x is not None and x > 0 else math.inf for x in score.mean]
+        spread = [math.inf if x is None else x for x in score.spread]
+        figures[f"completion/{name} totals log10 bias"] = float(np.mean(bias))
+        figures[f"completion/{name} totals spread"] = float(np.mean(spread))
+    return figures
 
 
 def relit_figures(outputs: StageOutputs, true: TrueRun) -> dict[str, float]:
@@ -187,7 +194,7 @@ def _by_decade(stage: str, estimate: F64, mean: F64, error: F64) -> dict[str, fl
     """By decade of the truth, log10 rmse and log10 bias of the observed entries; the truth's noise is removed."""
     seen = np.isfinite(estimate)
     figures = {}
-    for s in score_reflectance(np.where(seen, estimate, 0.0), mean, error, seen, DECADES):
+    for s in score_entries(np.where(seen, estimate, 0.0), mean, error, seen, DECADES):
         figures[f"{stage}/decade {s.decade} log10 rmse"] = math.inf if s.log10_rmse is None else s.log10_rmse
         figures[f"{stage}/decade {s.decade} log10 bias"] = math.inf if s.log10_bias is None else s.log10_bias
     return figures

@@ -4,6 +4,7 @@ It reads CAPTURE (rig.json, sensor.json, scan.ply, plan.json and the stream) and
 where no renderer is installed. It writes into WORK:
 
     calibration.json  samples.npz  model-<method>.npz  relit/<method>/<light>@<view>.npy ((L, H, W) float32)
+    relit-variance/<method>/<light>@<view>.npy ((2, L, H, W), where the method states one: `image_variance`)
     pipeline.json     stages, methods, capture statistics, what was left out and why, warnings
 """
 
@@ -24,6 +25,7 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 
+from hw.base.arrays import F32
 from hw.base.config import Strict, read_json
 from hw.base.errors import DiscoError, InputError, refused_by_the_disk
 from hw.base.files import replacing, write_json
@@ -114,14 +116,22 @@ def relight(models: dict[str, RelightableModel], request: Request, work: Path, s
             lights = {light.name: model.lit_by(light) for light in wanted.lights}
             shared[surface] = lights, {name: model.seen_by(camera) for name, camera in cameras.items()}
         with stages.stage(f"relight {method}"):
-            folder = work / "relit" / method
-            folder.mkdir(parents=True, exist_ok=True)
             for light, lit in shared[surface][0].items():
                 for view, seen in shared[surface][1].items():
-                    with replacing(folder / f"{light}@{view}.npy") as file:
-                        np.save(file, model.image(lit, seen))
+                    _keep(work / "relit" / method / f"{light}@{view}.npy", model.image(lit, seen))
+                    _keep(work / "relit-variance" / method / f"{light}@{view}.npy", model.image_variance(lit, seen))
         seconds[method] = time.perf_counter() - start
     return seconds
+
+
+def _keep(path: Path, array: F32 | None) -> None:
+    """Write an array; remove that of another model where there is none."""
+    if array is None:
+        path.unlink(missing_ok=True)
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as file:
+        np.save(file, array)
 
 
 def run(capture: Path, work: Path, request: Request, given: Path | None = None) -> dict[str, Any]:

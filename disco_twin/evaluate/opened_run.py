@@ -12,13 +12,16 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from disco_twin.evaluate import scores
+from disco_twin.evaluate.columns import score_columns
 from disco_twin.experiment.experiment import Experiment
+from disco_twin.experiment.object_pixels import ObjectPixels
 from disco_twin.experiment.pipeline_process import load_results
 from disco_twin.experiment.references import reference_path
 from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.light.references import HALVES, LAYERS, load_reference
 from disco_twin.light.truth import Truth
 from disco_twin.scene.scene import Scene
+from hw.base.arrays import Bool
 from hw.base.errors import InputError
 from hw.record import RawImage
 from pipeline.calibrate.calibration import Calibration
@@ -150,11 +153,11 @@ class OpenedRun:
 
     @cached_property
     def truth(self) -> xr.Dataset:
-        """True R_d from some vertices (`vertex_in`) to all. Compare with a model's `reflectance_columns`."""
+        """Exitance per irradiance from some vertices (`vertex_in`) to all; a model's own are its `exitance_columns`."""
         self._finished("truth")
         truth, dims = Truth.load(self.folder.twin / "truth.npz"), "laser vertex_in vertex"
         arrays = {
-            "reflectance": _array(truth.mean, dims, "mm-2"),
+            "exitance": _array(truth.mean, dims, "mm-2"),
             "standard_error": _array(truth.standard_error, dims, "mm-2"),
             "vertex_area": _array(truth.area, "vertex", "mm2"),
         }
@@ -172,16 +175,26 @@ class OpenedRun:
 
     @cached_property
     def masks(self) -> xr.DataArray:
-        """(view, row, column) pixels that the object fills by at least a half: those that are scored."""
-        masks = [[self.experiment.object_mask(view).astype(float) for view in self.scene.relight.views]]
-        return _array(_stacked(masks)[0] == 1, "view row column", "1", view=self._relit_names["view"])
+        """(view, row, column) pixels that the object fills by at least a half."""
+        return self._where(lambda pixels: pixels.mask)
+
+    @cached_property
+    def rims(self) -> xr.DataArray:
+        """(view, row, column) those of `masks` that see the surface so obliquely that they are scored apart."""
+        return self._where(lambda pixels: pixels.rim)
+
+    def _where(self, chosen: Callable[[ObjectPixels], Bool]) -> xr.DataArray:
+        views = self.scene.relight.views
+        images = [[chosen(self.experiment.object_pixels(view)).astype(float) for view in views]]
+        return _array(_stacked(images)[0] == 1, "view row column", "1", view=self._relit_names["view"])
 
     @cached_property
     def scores(self) -> xr.Dataset:
-        """nrmse and the other scores by model, light and view; log10_rmse of R_d and coverage by model and decade."""
+        """nrmse and the other scores by model, light and view; log10_rmse of R_d and coverage by model and decade;
+        column totals over the truth's by model, columns (lit or unlit) and laser.
+        """
         self._finished("scores")
-        kept = scores.load_scores(self.folder)
-        return _scores(kept["relit"], kept["reflectance"])
+        return _scores(scores.load_scores(self.folder), len(self.scene.rig.lasers))
 
     def relight(self, model: RelightableModel) -> xr.DataArray:
         """Images of a model under the scene's lights in its held-out views, named as those of `relit`."""
@@ -198,7 +211,8 @@ class OpenedRun:
             return np.asarray(images.sel(light=light, view=view.name)[:, : view.height, : view.width])
 
         rows = scores.score_images(self.experiment, self.folder, (name,), image)
-        return _scores(rows, scores.score_reflectances(self.folder, {name: lambda: model}))
+        columns = score_columns(self.experiment, self.folder, {name: lambda: model})
+        return _scores({"relit": rows} | columns, len(self.scene.rig.lasers))
 
     @property
     def _lasers(self) -> dict[str, Any]:
@@ -230,11 +244,12 @@ def _stacked(images: Sequence[Sequence[NDArray[Any]]]) -> NDArray[Any]:
     return np.stack([np.stack([padded(image) for image in row]) for row in images])
 
 
-def _scores(relit: Sequence[Mapping[str, Any]], reflectance: Mapping[str, Any]) -> xr.Dataset:
-    """Rows of `score_images` and the decades of `score_reflectances`; None becomes NaN.
+def _scores(kept: Mapping[str, Any], lasers: int) -> xr.Dataset:
+    """Rows of `score_images` as `relit`, and what `score_columns` makes; None becomes NaN.
 
     The axis is called `model`: xarray's `sel` has an option `method` of its own.
     """
+    relit, reflectance, totals = (kept[key] for key in ("relit", "reflectance", "totals"))
     names = {axis: list(dict.fromkeys(row[key] for row in relit)) for axis, key in AXES.items()}
     by_place = {tuple(row[key] for key in AXES.values()): row for row in relit}
 
@@ -242,10 +257,20 @@ def _scores(relit: Sequence[Mapping[str, Any]], reflectance: Mapping[str, Any]) 
         rows = [[[by_place[m, x, v][figure] for v in names["view"]] for x in names["light"]] for m in names["model"]]
         return np.array(rows, np.float64)
 
-    out: dict[str, Any] = {figure: (tuple(AXES), table(figure)) for figure in scores.KEPT}
+    figures = (*scores.KEPT, *(f"rim_{figure}" for figure in scores.RIM))
+    out: dict[str, Any] = {figure: (tuple(AXES), table(figure)) for figure in figures}
     decades = list(dict.fromkeys(d for own in reflectance.values() if own for d in own["coverage"]))
     parts = {"log10_rmse_measured": "measured", "log10_rmse_completed": "completed", "coverage": "coverage"}
     for label, part in parts.items():
         rows = [[((reflectance.get(m) or {}).get(part) or {}).get(d) for d in decades] for m in names["model"]]
         out[label] = ("model", "decade"), np.array(rows, np.float64).reshape(len(rows), len(decades))
-    return xr.Dataset(out, names | {"decade": [int(d) for d in decades]})
+    columns = ("lit", "unlit")
+    for figure in ("mean", "spread"):
+        out[f"totals_{figure}"] = (
+            ("model", "columns", "laser"),
+            np.array(
+                [[totals[m][c][figure] if m in totals else lasers * [None] for c in columns] for m in names["model"]],
+                np.float64,
+            ),
+        )
+    return xr.Dataset(out, names | {"decade": [int(d) for d in decades], "columns": list(columns)})

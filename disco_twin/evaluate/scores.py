@@ -1,52 +1,58 @@
-"""Relit images against references, R_d against the truth, for every method of a run."""
+"""Relit images against references, columns of exitance against the truth, for every method of a run."""
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from disco_twin.evaluate.columns import score_columns
+from disco_twin.evaluate.z_scores import ZScores, z_of_pixels
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.references import reference_path
 from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.light.references import LAYERS, load_reference
-from disco_twin.light.truth import Truth
-from hw.base.arrays import F32, Bool
+from hw.base.arrays import F32, F64, Bool
 from hw.base.config import Strict, read_json
 from hw.base.errors import InputError
 from hw.base.files import write_json
 from pipeline.geometry.nominal_rig import CameraConfig
 from pipeline.model.relightable import RelightableModel
 from pipeline.relight.lights import Light
-from pipeline.relight.scores import Unscorable, score_reflectance, score_relit
+from pipeline.relight.scores import Unscorable, score_relit
 
 log = logging.getLogger(__name__)
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 KEPT = ("nrmse", "nrmse_se", "nrmse_floor", "psnr", "energy_ratio")
+RIM = ("nrmse", "nrmse_se")
 
 
 class _Scores(Strict):
     """scores.json."""
 
-    format_version: Literal[1]
+    format_version: Literal[2]
     relit: tuple[dict[str, float | str | None], ...]
     reflectance: dict[str, dict[str, dict[str, float | None]] | None]
+    totals: dict[str, dict[str, dict[str, Any]]]
+    neck: dict[str, dict[str, Any]] | None
+    z: dict[str, dict[str, Any]]
 
 
 def score_run(experiment: Experiment, folder: RunFolder, methods: Sequence[str]) -> None:
-    """Write OUT/twin/scores.json: `relit` rows of every light, view and method, and `reflectance` by method."""
-    scores = {
-        "format_version": FORMAT_VERSION,
-        "relit": score_relit_images(experiment, folder, methods),
-        "reflectance": score_reflectances(folder, {m: partial(load_model, folder, m) for m in methods}),
-    }
-    write_json(folder.scores_file, scores)
+    """Write OUT/twin/scores.json: `relit` rows of every light, view and method, and what `score_columns` makes."""
+    relit = score_relit_images(experiment, folder, methods)
+    columns = score_columns(experiment, folder, {m: partial(load_model, folder, m) for m in methods})
+    for method, z in columns["z"].items():
+        image, variance = partial(load_relit, folder, method), partial(load_variance, folder, method)
+        z["pixels"] = z_of_images(experiment, folder, image, variance)
+    write_json(folder.scores_file, {"format_version": FORMAT_VERSION, "relit": relit} | columns)
 
 
 def load_scores(folder: RunFolder) -> dict[str, Any]:
@@ -66,20 +72,47 @@ def score_images(
     methods: Sequence[str],
     image_of: Callable[[str, str, CameraConfig], F32],
 ) -> list[dict[str, Any]]:
-    """Rows {light, view, method, nrmse, nrmse_se, nrmse_floor, psnr, energy_ratio}; what has no score holds None.
+    """Rows {light, view, method, nrmse, nrmse_se, nrmse_floor, psnr, energy_ratio, rim_nrmse, rim_nrmse_se}; what has
+    no score holds None. The rim's figures are of the object's pixels at its rim, all others of those without it.
 
     image_of: method, light, view -> (L, H, W) relit image in W/(mm^2 sr)
     """
     rows = []
-    masks = {view.name: experiment.object_mask(view) for view in experiment.scene.relight.views}
     for light in experiment.scene.relight.lights:
         for view in experiment.scene.relight.views:
             a, b = reference_halves(folder, light, view)
+            pixels = experiment.object_pixels(view)
             for method in methods:
                 image = image_of(method, light.name, view)
                 row = {"light": light.name, "view": view.name, "method": method}
-                rows.append(row | usable_score(" ".join(row.values()), image, a, b, masks[view.name]))
+                what = " ".join(row.values())
+                inner = usable_score(what, image, a, b, pixels.inner)
+                rim = usable_score(f"the rim of {what}", image, a, b, pixels.rim) if pixels.rim.any() else {}
+                rows.append(row | inner | {f"rim_{key}": rim.get(key) for key in RIM})
     return rows
+
+
+def z_of_images(
+    experiment: Experiment,
+    folder: RunFolder,
+    image_of: Callable[[str, CameraConfig], F32],
+    variance_of: Callable[[str, CameraConfig], F32],
+) -> dict[str, Any]:
+    """By light, `ZScores` of the pixels of all views together without their rims, the errors of the model's entries
+    taken as `independent` and as `alike`.
+
+    image_of, variance_of: light, view -> (L, H, W) relit image, and its variance (`RelightableModel.image_variance`)
+    """
+    out: dict[str, Any] = {}
+    for light in experiment.scene.relight.lights:
+        parts: dict[str, list[F64]] = {"independent": [], "alike": []}
+        for view in experiment.scene.relight.views:
+            halves, inner = reference_halves(folder, light, view), experiment.object_pixels(view).inner
+            image = image_of(light.name, view)
+            for z, variance in zip(parts.values(), variance_of(light.name, view), strict=True):
+                z.append(z_of_pixels(image, variance, halves, inner))
+        out[light.name] = {name: asdict(ZScores.of(np.concatenate(z, axis=None))) for name, z in parts.items()}
+    return out
 
 
 def usable_score(what: str, image: F32, a: F32, b: F32, mask: Bool) -> dict[str, float | None]:
@@ -100,8 +133,16 @@ def reference_halves(folder: RunFolder, light: Light, view: CameraConfig) -> F32
 
 
 def load_relit(folder: RunFolder, method: str, light: str, view: CameraConfig) -> F32:
-    """(L, H, W) relit image in W/(mm^2 sr)."""
-    path = folder.work / "relit" / method / f"{light}@{view.name}.npy"
+    """(L, H, W) relit image in W/(mm^2 sr). Raises: InputError where it is missing or damaged."""
+    return _load_image(folder, folder.work / "relit" / method / f"{light}@{view.name}.npy", 3, view)
+
+
+def load_variance(folder: RunFolder, method: str, light: str, view: CameraConfig) -> F32:
+    """(2, L, H, W) variance of a relit image (`RelightableModel.image_variance`). Raises: as `load_relit`."""
+    return _load_image(folder, folder.work / "relit-variance" / method / f"{light}@{view.name}.npy", 4, view)
+
+
+def _load_image(folder: RunFolder, path: Path, axes: int, view: CameraConfig) -> F32:
     if not path.is_file():
         raise InputError("is missing", file=path, remedy=f"disco-twin reconstruct --out {folder.root}")
     remedy = f"delete it, then disco-twin reconstruct --out {folder.root}"
@@ -109,8 +150,8 @@ def load_relit(folder: RunFolder, method: str, light: str, view: CameraConfig) -
         image = np.asarray(np.load(path, allow_pickle=False))
     except (OSError, ValueError, EOFError, SyntaxError) as error:
         raise InputError("is damaged", file=path, remedy=remedy) from error
-    if image.ndim != 3 or image.shape[1:] != (view.height, view.width) or image.dtype.kind != "f":
-        allowed = f"(lasers, {view.height}, {view.width})"
+    if image.ndim != axes or image.shape[-2:] != (view.height, view.width) or image.dtype.kind != "f":
+        allowed = f"({'2, ' * (axes - 3)}lasers, {view.height}, {view.width})"
         raise InputError(f"is no image of this view but of {image.shape}", file=path, allowed=allowed, remedy=remedy)
     return image
 
@@ -118,30 +159,3 @@ def load_relit(folder: RunFolder, method: str, light: str, view: CameraConfig) -
 def load_model(folder: RunFolder, method: str) -> RelightableModel:
     """A method's model. Raises: InputError where its file is missing, damaged or of another version."""
     return RelightableModel.load(folder.work / f"model-{method}.npz")
-
-
-def score_reflectances(folder: RunFolder, models: Mapping[str, Callable[[], RelightableModel]]) -> dict[str, Any]:
-    """By method, given how to get its model: log10_rmse of measured and of all entries, and the coverage, each by
-    decade below the peak.
-
-    A method whose R_d cannot be scored has None; one whose model states no R_d is left out.
-    """
-    truth = Truth.load(folder.twin / "truth.npz")
-    out: dict[str, Any] = {}
-    for method, model in models.items():
-        estimate = model().reflectance_columns(truth.columns)
-        if estimate is None:
-            continue
-        try:
-            own = score_reflectance(estimate.mean, truth.mean, truth.standard_error, estimate.measured)
-            full = score_reflectance(estimate.mean, truth.mean, truth.standard_error, True)
-        except Unscorable as why:
-            log.warning("no score for the R_d of %s: %s", method, why)
-            out[method] = None
-            continue
-        out[method] = {
-            "measured": {str(s.decade): s.log10_rmse for s in own},
-            "completed": {str(s.decade): s.log10_rmse for s in full},
-            "coverage": {str(s.decade): s.coverage for s in own},
-        }
-    return out

@@ -25,7 +25,8 @@ def make_summary(
     left_out: Sequence[dict[str, str]],
 ) -> dict[str, Any]:
     """The summary; `scores` as `disco_twin.evaluate.scores.score_run` wrote them, `calibration` as the pipeline did."""
-    own = scores["reflectance"].get(method, {"measured": {}, "coverage": {}}) or {"measured": None, "coverage": None}
+    parts = ("measured", "completed", "coverage")
+    own = scores["reflectance"].get(method, {part: {} for part in parts}) or dict.fromkeys(parts)
     with StreamReader(folder.capture) as stream:
         capture = {
             "images": len(stream),
@@ -45,9 +46,15 @@ def make_summary(
         "simulation_noise": measured_noise(scene, folder.twin / "responses"),
         "calibration": calibration,
         "relit": scores["relit"],
-        "reflectance": {"log10_rmse_by_decade": own["measured"], "coverage_by_decade": own["coverage"]},
+        "z": scores["z"].get(method),
+        "reflectance": {
+            "log10_rmse_by_decade": own["measured"],
+            "log10_rmse_all_by_decade": own["completed"],
+            "coverage_by_decade": own["coverage"],
+            "totals": scores["totals"].get(method),
+        },
         "left_out": list(left_out),
-    }
+    } | ({} if scores["neck"] is None else {"neck": scores["neck"]})
 
 
 def rms(values: Sequence[float]) -> float:
@@ -56,10 +63,10 @@ def rms(values: Sequence[float]) -> float:
     return float(np.copysign(abs(square) ** 0.5, square))
 
 
-def pooled(relit: Sequence[Mapping[str, Any]], method: str, light: str | None = None) -> float:
+def pooled(relit: Sequence[Mapping[str, Any]], method: str, light: str | None = None, figure: str = "nrmse") -> float:
     """rms of a method's nrmse over the views, and over the lights unless one is given; NaN where there is no score."""
     rows = [r for r in relit if r["method"] == method and light in (None, r["light"])]
-    return rms([float(r["nrmse"]) for r in rows if r["nrmse"] is not None])
+    return rms([float(r[figure]) for r in rows if r.get(figure) is not None])
 
 
 def figure_or_dash(value: float | None) -> str:

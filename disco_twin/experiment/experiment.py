@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import trimesh
 
+from disco_twin.experiment.object_pixels import ObjectPixels
 from disco_twin.object.build import TwinObject, build_object, build_scan
 from hw.base.arrays import Bool
+from hw.base.errors import InputError
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.nominal_rig import CameraConfig
 from pipeline.plan.plan import Plan, make_plan
 from pipeline.plan.visibility import warn_of_frame
@@ -21,14 +22,13 @@ if TYPE_CHECKING:
     from disco_twin.light.transport import Transport
     from disco_twin.scene.scene import Scene  # its settings of the reconstruction are no part of what is simulated
 
-SUPERSAMPLE = 4  # rays per pixel and axis that decide which pixels show the object
-
 
 class Experiment:
     """A scene with its object, scan, plan and light transport. Only `transport` needs the renderer."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
+        self._pixels: dict[str, ObjectPixels] = {}
 
     @cached_property
     def object(self) -> TwinObject:
@@ -74,12 +74,30 @@ class Experiment:
         tree = np.random.SeedSequence([self.scene.seed, zlib.crc32(purpose.encode())])
         return int(tree.generate_state(1)[0])
 
-    def object_mask(self, view: CameraConfig) -> Bool:
-        """(H, W) pixels of a held-out view that the object fills by at least a half."""
-        camera = PinholeCamera.from_config(view)
-        face = RayMesh.of(self.object.mesh).first_hit(*camera.rays(camera.pixel_centres(SUPERSAMPLE))).triangle
-        fine = (face >= 0).reshape(camera.height, SUPERSAMPLE, camera.width, SUPERSAMPLE)
-        return np.asarray(fine.mean(axis=(1, 3)) >= 0.5)
+    def object_pixels(self, view: CameraConfig) -> ObjectPixels:
+        """The pixels of a held-out view that show the object."""
+        key = view.model_dump_json()
+        if key not in self._pixels:
+            self._pixels[key] = ObjectPixels.of(self.object.mesh, PinholeCamera.from_config(view))
+        return self._pixels[key]
+
+    @cached_property
+    def beyond_neck(self) -> Bool | None:
+        """(V,) the scan's vertices on that side of the neck to which its normal points; None where the scene has none.
+
+        Raises: InputError where the plane does not cut the scan.
+        """
+        neck = self.scene.relight.neck
+        if neck is None:
+            return None
+        beyond = (np.asarray(self.scan.vertices) - neck.through_mm) @ np.array(neck.normal) > 0
+        if beyond.all() or not beyond.any():
+            low, high = self.scan.bounds
+            raise InputError(
+                "the neck's plane does not cut the object", key="relight.neck.through_mm", value=neck.through_mm,
+                allowed=f"inside {low.round(1).tolist()} .. {high.round(1).tolist()}", remedy="move or turn the plane",
+            )  # fmt: skip
+        return np.asarray(beyond)
 
 
 def mm_per_pixel(camera: CameraConfig) -> float:

@@ -1,4 +1,4 @@
-"""The true R_d of a scene: columns of it, computed a few at a time."""
+"""The truth of a scene: columns of exitance per irradiance, computed a few at a time."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
 COLUMNS_AT_ONCE = 4  # between two reports of the progress
 
 
-def true_reflectance(experiment: Experiment, columns: Sequence[int] | I64, walks: int) -> Truth:
-    """The true R_d from these scan vertices to all others, from `walks` photons a column. Needs the renderer."""
+def true_exitance(experiment: Experiment, columns: Sequence[int] | I64, walks: int) -> Truth:
+    """The truth from these scan vertices to all others, from `walks` photons a column. Needs the renderer."""
     basis = hat_basis(experiment.object.mesh, experiment.scan)
     return truth_columns(experiment.transport, basis, np.asarray(columns, np.int64), walks, experiment.seed("truth"))
 
 
 def compute_truth(experiment: Experiment, path: Path, progress: Progress) -> None:
-    """Write the scene's columns of the true R_d, spread evenly over the surface, a few at a time."""
+    """Write the scene's columns of the truth, spread evenly over the surface, a few at a time."""
     points, work, parts = np.asarray(experiment.scan.vertices, float), experiment.scene.simulation, []
     columns = np.sort(farthest_points(points, np.ones(len(points)), work.truth_columns))
     for low in range(0, len(columns), COLUMNS_AT_ONCE):
         part = columns[low : low + COLUMNS_AT_ONCE]
-        parts.append(true_reflectance(experiment, part, work.truth_walks))
+        parts.append(true_exitance(experiment, part, work.truth_walks))
         progress(low + len(part), len(columns))
     _joined(parts).save(path)
 
@@ -45,8 +45,7 @@ def _joined(parts: Sequence[Truth]) -> Truth:
     mean = {k: np.average([getattr(p.balance, k) for p in parts], axis=0, weights=weights) for k in names}
     return Truth(
         np.concatenate([p.columns for p in parts]),
-        np.concatenate([p.mean for p in parts], axis=1),
-        np.concatenate([p.standard_error for p in parts], axis=1),
+        np.concatenate([p.replicates for p in parts], axis=2),
         parts[0].area,
         EnergyBalance(**mean),
     )

@@ -30,7 +30,7 @@ def pipeline_inputs(scene: Scene, methods: Sequence[str]) -> dict[str, Any]:
     return {
         "format_version": 1,
         "reconstruct": scene.reconstruct.model_copy(update={"methods": tuple(methods)}).model_dump(mode="json"),
-        "relight": scene.relight.model_dump(mode="json"),
+        "relight": scene.relight.model_dump(mode="json", include={"views", "lights"}),
     }
 
 

@@ -2,7 +2,7 @@
 
 OUT/scene.toml  run.log  stages.json  summary.json  report.html
 OUT/capture/    all that the pipeline reads        OUT/work/   the pipeline's outputs
-OUT/twin/       what the pipeline never sees: the simulated responses, true R_d, references
+OUT/twin/       what the pipeline never sees: the simulated responses, truth, references
 """
 
 from __future__ import annotations

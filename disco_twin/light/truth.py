@@ -1,12 +1,14 @@
-"""Ground-truth R_d from photons of its own (docs/conventions.md, "R_d"); the pipeline never sees it.
+"""The truth: exitance per irradiance from photons of its own; the pipeline never sees it.
 
-Photons are launched cosine-weighted over the hat function of vertex u, their escaped power is weighted by the hat
-function of vertex v: cosine in, cosine out, which is what is reciprocal.
+M(u, v) = power that leaves over the hat function of vertex v / (its area * power that arrives over that of vertex u),
+in mm^-2, for light that arrives from all directions alike (Lambertian): cosine in, cosine out is what is reciprocal. No
+index is in it. A model's own is Tbar^2 R_d (`RelightableModel.exitance_columns`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,9 +16,8 @@ import numpy as np
 from scipy import sparse
 
 from disco_twin.light.balance import EnergyBalance
-from hw.base.arrays import F64, I64
+from hw.base.arrays import F32, F64, I64
 from hw.base.files import load_arrays, save_arrays
-from pipeline.geometry.fresnel import mean_transmittance
 from pipeline.geometry.mesh import RayMesh
 
 if TYPE_CHECKING:
@@ -24,23 +25,32 @@ if TYPE_CHECKING:
 
 
 REPLICATES = 8
-FORMAT_VERSION = 2
-ARRAYS = ("columns", "mean", "standard_error", "area")
+FORMAT_VERSION = 3
+ARRAYS = ("columns", "replicates", "area")
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Columns of R_d on the scan's vertices.
+    """Columns of M on the scan's vertices.
 
-    columns: (n,) vertices; mean, standard_error: (L, n, V) in mm^-2 (index: laser, lit vertex, seen vertex), from
-    `REPLICATES` independent replicates; area: (V,) integral of each hat function in mm^2; balance: where light went.
+    columns: (n,) vertices; replicates: (R, L, n, V) in mm^-2 (index: replicate, laser, lit vertex, seen vertex),
+    independent of each other; area: (V,) integral of each hat function in mm^2; balance: where light went.
     """
 
     columns: I64
-    mean: F64
-    standard_error: F64
+    replicates: F32
     area: F64
     balance: EnergyBalance
+
+    @cached_property
+    def mean(self) -> F64:
+        """(L, n, V) mm^-2."""
+        return self.replicates.mean(axis=0, dtype=np.float64)
+
+    @cached_property
+    def standard_error(self) -> F64:
+        """(L, n, V) mm^-2, of `mean`."""
+        return standard_error(self.replicates)
 
     def save(self, path: Path) -> None:
         """Write an .npz, replacing any older one at once."""
@@ -53,7 +63,12 @@ class Truth:
         names = (*ARRAYS, *(f"balance_{k}" for k in EnergyBalance.__dataclass_fields__))
         _, data = load_arrays(path, FORMAT_VERSION, "delete it, disco-twin run computes it again", names)
         balance = EnergyBalance(**{k: data[f"balance_{k}"] for k in EnergyBalance.__dataclass_fields__})
-        return cls(data["columns"], data["mean"], data["standard_error"], data["area"], balance)
+        return cls(data["columns"], data["replicates"], data["area"], balance)
+
+
+def standard_error(replicates: F32 | F64) -> F64:
+    """(R, ...) independent replicates -> (...) standard error of their mean."""
+    return np.asarray(replicates.std(axis=0, ddof=1, dtype=np.float64) / np.sqrt(len(replicates)))
 
 
 def hat_areas(transport: Transport, basis: sparse.csr_matrix) -> F64:
@@ -62,7 +77,7 @@ def hat_areas(transport: Transport, basis: sparse.csr_matrix) -> F64:
 
 
 def truth_columns(transport: Transport, basis: sparse.csr_matrix, columns: I64, walks: int, seed: int) -> Truth:
-    """R_d[u, v] = (escaped power weighted by hat v) / (area of v * Tbar^2) per watt that falls on hat u.
+    """M[u, v] = (escaped power weighted by hat v) / area of v, per watt that arrives over hat u.
 
     basis: (V_fine, V) the hat functions' values at the vertices of the mesh that light is traced on; walks: a column.
     """
@@ -83,7 +98,5 @@ def truth_columns(transport: Transport, basis: sparse.csr_matrix, columns: I64, 
     n, lasers = len(columns), transport.lasers
     power = np.stack([(basis.T @ deposit.T).T for deposit in traced.deposits])  # (n * replicates, L, V)
     area = hat_areas(transport, basis)
-    both = mean_transmittance(transport.object.boundary.eta) ** 2
-    reflectance = power.reshape(n, REPLICATES, lasers, -1).transpose(1, 2, 0, 3) / (area * both)
-    error = reflectance.std(axis=0, ddof=1) / np.sqrt(REPLICATES)
-    return Truth(np.asarray(columns), reflectance.mean(axis=0), error, area, traced.balance)
+    exitance = power.reshape(n, REPLICATES, lasers, -1).transpose(1, 2, 0, 3) / area
+    return Truth(np.asarray(columns), exitance.astype(np.float32), area, traced.balance)

@@ -33,8 +33,8 @@ def collect(experiment: Experiment, folder: RunFolder, summary: dict[str, Any]) 
     distance = np.linalg.norm(points[truth.columns][:, None] - points[None], axis=2)
     sensor = Calibration.load(folder.work / "calibration.json").sensor
     shown, damaged = impulses(experiment.scene.rig, folder.capture, sensor)
-    columns = {method: load_model(folder, method).reflectance_columns(truth.columns) for method in methods}
-    made = load_results(folder)
+    columns = {method: load_model(folder, method).exitance_columns(truth.columns) for method in methods}
+    made, scores = load_results(folder), load_scores(folder)
     return ReportData(
         summary=summary,
         wavelengths_nm=[laser.wavelength_nm for laser in scene.rig.lasers],
@@ -44,7 +44,8 @@ def collect(experiment: Experiment, folder: RunFolder, summary: dict[str, Any]) 
         distance=distance,
         truth=truth.mean,
         models={m: np.asarray(own.mean, np.float64) for m, own in columns.items() if own is not None},
-        decades={m: scores for m, scores in load_scores(folder)["reflectance"].items() if scores is not None},
+        decades={m: own for m, own in scores["reflectance"].items() if own is not None},
+        totals=scores["totals"],
         seconds={name: entry.seconds for name, entry in made.methods.items()},
         balance={
             term: list(getattr(truth.balance, term) / truth.balance.launched)
@@ -102,7 +103,7 @@ def comparisons(
 ) -> list[Comparison]:
     """Relit images beside the reference (its subsurface layer, both halves together) for every light and view."""
     out = []
-    masks = {view.name: experiment.object_mask(view) for view in experiment.scene.relight.views}
+    masks = {view.name: experiment.object_pixels(view).mask for view in experiment.scene.relight.views}
     for light in experiment.scene.relight.lights:
         for view in experiment.scene.relight.views:
             rows = [r for r in relit if r["light"] == light.name and r["view"] == view.name]

@@ -182,7 +182,10 @@ def pareto_figure(points: Mapping[str, tuple[float, float]]) -> Figure:
 def reflectance_figure(
     distance: F64, truth: F64, models: Mapping[str, F64], wavelengths_nm: Sequence[float], bins: int = 22
 ) -> Figure:
-    """R_d against distance: median and 10-90 % band, truth and models. distance (n, V) mm; R_d (L, n, V) 1/mm^2."""
+    """Exitance per irradiance against distance: median and 10-90 % band, truth and models.
+
+    distance: (n, V) mm; truth, models: (L, n, V) mm^-2
+    """
     lasers = truth.shape[0]
     figure, axes = new_figure(3.4 * lasers + 0.4, 3.1, ncols=lasers, sharey=True, squeeze=False)
     edges = np.linspace(0, float(distance.max()) * 1.0001, bins + 1)
@@ -205,7 +208,7 @@ def reflectance_figure(
         axis.set_ylim(peak * 1e-6, peak * 2)
         axis.set_title(f"{wavelengths_nm[laser]:g} nm", loc="left")
         axis.set_xlabel("distance between the vertices, mm")
-    axes[0][0].set_ylabel("$R_d$, mm$^{-2}$")
+    axes[0][0].set_ylabel("exitance per irradiance, mm$^{-2}$")
     axes[0][-1].legend()
     return figure
 

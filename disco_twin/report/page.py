@@ -29,8 +29,10 @@ BROAD = ("uniform", "directional", "environment")
 class ReportData:
     """What the page shows beyond the summary; what is left empty is left out of the page.
 
-    distance: (n, V) mm from the truth columns' vertices; truth: (L, n, V); models: the same by method, mm^-2
+    distance: (n, V) mm from the truth columns' vertices; truth: (L, n, V) exitance per irradiance; models: the same by
+        method, mm^-2
     decades: by method, the log10 rmse of "measured" and of all ("completed") entries and the "coverage" by decade
+    totals: by method, of `lit` and `unlit` columns, the fields of `evaluate.totals.TotalsScore`
     seconds: reconstruction and relighting of each method; balance: term -> share of the launched power per wavelength
     imbalance: largest departure of their sum from one, roulette included
     """
@@ -44,6 +46,7 @@ class ReportData:
     truth: F64 | None = None
     models: Mapping[str, F64] = field(default_factory=dict)
     decades: Mapping[str, Mapping[str, Mapping[str, float | None]]] = field(default_factory=dict)
+    totals: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
     balance: Mapping[str, Sequence[float]] = field(default_factory=dict)
     imbalance: float = 0.0
@@ -59,7 +62,13 @@ def render(data: ReportData) -> str:
     """The page as HTML: `templates/report.html.j2`, with the figures embedded as PNG."""
     loader = PackageLoader("disco_twin.report")
     page = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    page.filters |= {"width": page_width, "png": png, "three_digits": figure_or_dash, "duration": duration}
+    page.filters |= {
+        "width": page_width,
+        "png": png,
+        "three_digits": figure_or_dash,
+        "duration": duration,
+        "with_error": with_error,
+    }
     relit = data.summary["relit"]
     methods = list(dict.fromkeys(str(row["method"]) for row in relit))
     errors = {method: pooled(relit, method) for method in methods}
@@ -72,20 +81,31 @@ def render(data: ReportData) -> str:
         light_rows=[light_row(relit, light, methods, data.main) for light in dict.fromkeys(r["light"] for r in relit)],
         pareto={m: (data.seconds[m], e) for m, e in errors.items() if m in data.seconds and e > 0},
         decades=decade_bars(data),
+        z_rows=z_rows(data.summary.get("z") or {}),
     )
 
 
 def light_row(relit: Sequence[Summary], light: str, methods: Sequence[str], main: str) -> dict[str, Any]:
-    """A light's row in the table of errors: every method's nrmse; energy ratios and noise of the main one."""
+    """A light's row in the table of errors: every method's nrmse; energy ratios, rim and noise of the main one."""
     errors = [pooled(relit, method, light) for method in methods]
     own = [row for row in relit if (row["light"], row["method"]) == (light, main)]
     return {
         "light": light,
         "errors": errors,
         "best": min((e for e in errors if np.isfinite(e)), default=None),
+        "rim": pooled(relit, main, light, "rim_nrmse"),
         "energy": [row["energy_ratio"] for row in own],
         "noise": rms([row["nrmse_floor"] for row in own if row["nrmse_floor"] is not None]),
     }
+
+
+def z_rows(z: Mapping[str, Any]) -> list[tuple[str, str, Summary]]:
+    """(what, how errors are taken, count and rms and share beyond 3) of all z-scores that there are."""
+    rows = [(f"entries, decade {decade}", "", own) for decade, own in z.get("entries", {}).items()]
+    for part, what in (("totals", "totals of {} columns"), ("pixels", "pixels under {}")):
+        for name, errors in z.get(part, {}).items():
+            rows += [(what.format(name), kind, own) for kind, own in errors.items()]
+    return [row for row in rows if row[2]["count"]]
 
 
 def decade_bars(data: ReportData) -> dict[str, Mapping[str, float | None]]:
@@ -94,6 +114,12 @@ def decade_bars(data: ReportData) -> dict[str, Mapping[str, float | None]]:
         return {}
     bars = {f"{data.main}, measured": data.decades[data.main]["measured"]}
     return bars | {method: scores["completed"] for method, scores in data.decades.items()}
+
+
+def with_error(figures: Mapping[str, Any], name: str) -> str:
+    """A figure of each wavelength and its standard error, `<name>_se`."""
+    pairs = zip(figures[name], figures[f"{name}_se"], strict=True)
+    return ", ".join(figure_or_dash(value) + ("" if error is None else f" ± {error:.3f}") for value, error in pairs)
 
 
 def page_width(figure: Figure) -> int:

@@ -158,9 +158,9 @@ def make_budget(run: Run, walks: int = WALKS) -> Budget:
 
 
 def _scored(run: Run, rows: Mapping[str, Images]) -> tuple[BudgetRow, ...]:
-    """Every image of these rows against its reference."""
+    """Every image of these rows against its reference, without the object's rim."""
     out, relight = [], run.scene.relight
-    masks = {view.name: run.experiment.object_mask(view) for view in relight.views}
+    masks = {view.name: run.experiment.object_pixels(view).inner for view in relight.views}
     for light in relight.lights:
         for view in relight.views:
             halves = reference_halves(run.folder, light, view)

@@ -36,6 +36,7 @@ def require_capturable(experiment: Experiment) -> None:
     for i, view in enumerate(experiment.scene.relight.views):
         require_in_sight(view, experiment.scan, f"relight.views[{i}]", f"the held-out view {view.name!r}")
     experiment.plan  # noqa: B018 - the plan refuses cameras, projector and spots that cannot be
+    experiment.beyond_neck  # noqa: B018 - refuses a neck beside the object
     if rig.faults.deviation and rig.spots < LEAST_SPOTS:
         raise InputError(
             "too few to find the projector from, and the rig is off the nominal one", key="rig.spots", value=rig.spots,

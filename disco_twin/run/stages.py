@@ -49,7 +49,7 @@ OUTPUTS = {  # files that a finished stage leaves, as patterns in the run folder
     "capture": CAPTURE,
     "truth": ("twin/truth.npz",),
     "references": REFERENCES,
-    "pipeline": ("work/pipeline.json", "work/model-*.npz", "work/request.json", "work/relit/*/*.npy"),
+    "pipeline": ("work/pipeline.json", "work/model-*.npz", "work/request.json", "work/relit*/*/*.npy"),
     "scores": ("twin/scores.json",),
 }
 CONTINUED = {  # files that interrupted work is continued from
@@ -230,7 +230,8 @@ def score_stages(run: Run) -> dict[str, Any]:
         )
     if done["truth"].key != run.key("truth"):
         log.warning("the code of the ground truth has changed since it was computed; `%s` computes it again", again)
-    key = run.key("scores", *(done[name].key for name in ("truth", "references", "pipeline")), list(run.methods))
+    neck = run.scene.relight.model_dump_json(include={"neck"})
+    key = run.key("scores", *(done[name].key for name in ("truth", "references", "pipeline")), list(run.methods), neck)
     run.stage("scores", key, lambda _: score_run(run.experiment, run.folder, run.methods))
     made = load_results(run.folder)
     left_out = [*left_out_by_the_twin(run.experiment), *made.left_out]

@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from disco_twin.scene.object_schema import ObjectConfig, ScanConfig
+from disco_twin.scene.object_schema import Direction, ObjectConfig, ScanConfig
 from disco_twin.scene.rig_schema import FaultsConfig, TwinRigConfig
 from hw.base.config import Strict, load_toml
-from pipeline.geometry.nominal_rig import CameraConfig
+from pipeline.geometry.nominal_rig import CameraConfig, Point
 from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.relight.lights import Colour, Light, shipped_lights
 
@@ -27,14 +27,22 @@ class SimulationConfig(Strict):
     reference_walks: Count = 20_000_000  # a light, both halves together
 
 
+class Neck(Strict):
+    """A plane in the object frame that parts head and body: light that crosses it is scored (thesis, figure 6.6)."""
+
+    through_mm: Point
+    normal: Direction = (0.0, 0.0, 1.0)
+
+
 class RelightConfig(Strict):
-    """What the model is tried on: held-out cameras in the object frame, and lights.
+    """What the model is tried on: held-out cameras in the object frame, lights, and where the object has one its neck.
 
     A light is a table or the name of a shipped one (those are placed by the first view); left out: all shipped ones.
     """
 
     views: Annotated[tuple[CameraConfig, ...], Field(min_length=2, max_length=16)]
     lights: Annotated[tuple[Light, ...], Field(validate_default=True)] = ()
+    neck: Neck | None = None
 
     @field_validator("lights", mode="before")
     @classmethod

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from hw.base.arrays import F64
+
+_NEAR_GRAZING = (1e-4, 1e-3, 1e-2, 0.1)  # F_t rises over a range of sqrt(eta^2 - 1) in the cosine
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,20 @@ class Boundary:
     eta: float
     cosines: tuple[float, ...] = (1.0,)
     ratio: tuple[float, ...] = (1.0,)
+
+    @cached_property
+    def mean_transmittance(self) -> float:
+        """Tbar = (1 / pi) integral F_t cos dw over the hemisphere, to ten digits.
+
+        The smooth mean in closed form, and what the ratio adds to it by Gauss's rule between the ratio's corners.
+        """
+        last = self.ratio[-1]
+        corners = np.unique(np.clip([0.0, *_NEAR_GRAZING, *self.cosines, 1.0], 0.0, 1.0))
+        low, high = corners[:-1, None], corners[1:, None]
+        nodes, weights = np.polynomial.legendre.leggauss(24)
+        c = 0.5 * (low + high + (high - low) * nodes)
+        added = (np.interp(c, self.cosines, self.ratio) - last) * transmittance(c, self.eta) * 2.0 * c
+        return float(last * mean_transmittance(self.eta) + (0.5 * (high - low) * weights * added).sum())
 
 
 def transmittance(cosine: ArrayLike, eta: float | Boundary) -> F64:

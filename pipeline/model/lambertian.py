@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from hw.base.arrays import F32
+import numpy as np
+
+from hw.base.arrays import F32, F64, I64
 from pipeline.geometry.mesh import RayMesh
 from pipeline.model.term import Axes, Term
 from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
@@ -22,3 +25,9 @@ class LambertianTerm(Term):
     def image(self, light: LightOnMesh, view: ViewOfMesh) -> F32:
         """Radiosity albedo * flux / area, linear on the faces."""
         return view.image(light.flux * self.albedo / RayMesh.of(light.mesh).vertex_areas)
+
+    def throughput(self, vertices: Sequence[int] | I64, area: F64) -> F64:
+        """The albedo, all of it where the light entered."""
+        out = np.zeros((self.lasers, len(vertices), len(area)))
+        out[:, np.arange(len(vertices)), vertices] = self.albedo[:, vertices]
+        return out

@@ -35,6 +35,22 @@ class GlobalTerm(Term):
             self._radiosity[light] = np.stack([q @ r for q, r in zip(light.flux, self.reflectance, strict=True)])
         return view.image(self._radiosity[light])
 
+    def image_variance(self, light: LightOnMesh, view: ViewOfMesh) -> F32 | None:
+        """Independent errors add up in squares from entry to vertex to pixel; errors that are alike simply add up."""
+        if self.variance is None:
+            return None
+        if light not in self._spread:
+            pairs = list(zip(light.flux, self.variance, strict=True))
+            independent = np.stack([q**2 @ v for q, v in pairs])
+            self._spread[light] = independent, np.stack([np.abs(q) @ np.sqrt(v) for q, v in pairs])
+        independent, alike = self._spread[light]
+        return np.stack([view.image(independent, squared=True), view.image(alike) ** 2])
+
+    @cached_property
+    def _spread(self) -> WeakKeyDictionary[LightOnMesh, tuple[F64, F64]]:
+        """(L, V) by light: variance of the radiosity for independent errors, deviation for errors that are alike."""
+        return WeakKeyDictionary()
+
     @cached_property
     def _radiosity(self) -> WeakKeyDictionary[LightOnMesh, F64]:
         """(L, V) W/mm^2 by light: the product costs more than the image, and serves all views."""

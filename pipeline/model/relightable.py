@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from hw.base.arrays import F32
+from hw.base.arrays import F32, F64
 from hw.base.errors import InputError
 from hw.base.files import load_arrays, save_arrays
 from pipeline.geometry.camera import PinholeCamera
@@ -64,17 +64,32 @@ class RelightableModel:
 
         Raises: ValueError where light or view were prepared for another surface, or the light for other lasers.
         """
-        for prepared in (light, view):
-            if prepared.boundary != self.boundary or not _same(prepared.mesh, self.mesh):
-                raise ValueError("prepared for another mesh or boundary: use the model's own lit_by and seen_by")
-        if light.lasers != self.lasers:
-            raise ValueError(f"prepared for {light.lasers} lasers, not {self.lasers}: use the model's own lit_by")
+        self._require_own(light, view)
         # Where a term for near light and the global term describe the same entries, the shares that split R_d between
         # them (a partition of unity over distance, so that no energy counts twice) belong here, beside the sum.
         total = self.terms[0].image(light, view)
         for term in self.terms[1:]:
             total = total + term.image(light, view)
         return total
+
+    def image_variance(self, light: LightOnMesh, view: ViewOfMesh) -> F32 | None:
+        """(2, L, H, W) variance of `image` as the terms state it, for independent errors of R_d's entries and for
+        errors that are all alike, between which it lies; None where a term states none. Raises: as `image`.
+        """
+        self._require_own(light, view)
+        parts = [term.image_variance(light, view) for term in self.terms]
+        known = [part for part in parts if part is not None]
+        if len(known) < len(parts):
+            return None
+        independent, alike = sum(part[0] for part in known), sum(np.sqrt(part[1]) for part in known) ** 2
+        return np.stack([independent, alike]).astype(np.float32)
+
+    def _require_own(self, light: LightOnMesh, view: ViewOfMesh) -> None:
+        for prepared in (light, view):
+            if prepared.boundary != self.boundary or not _same(prepared.mesh, self.mesh):
+                raise ValueError("prepared for another mesh or boundary: use the model's own lit_by and seen_by")
+        if light.lasers != self.lasers:
+            raise ValueError(f"prepared for {light.lasers} lasers, not {self.lasers}: use the model's own lit_by")
 
     def reflectance_columns(self, vertices: Sequence[int] | NDArray[np.int64]) -> ReflectanceColumns | None:
         """R_d from these vertices to all; None where no term states any: there is then nothing to score R_d by."""
@@ -86,6 +101,25 @@ class RelightableModel:
             both = None if total.variance is None or part.variance is None else total.variance + part.variance
             total = ReflectanceColumns(total.mean + part.mean, both, total.measured | part.measured)
         return total
+
+    def exitance_columns(self, vertices: Sequence[int] | NDArray[np.int64]) -> ReflectanceColumns | None:
+        """Tbar^2 R_d in mm^-2, exitance per irradiance under light from all directions; None as `reflectance_columns`.
+
+        Images determine this product alone, not R_d's level and the boundary's apart: what the truth is compared with.
+        """
+        columns, both = self.reflectance_columns(vertices), self.boundary.mean_transmittance**2
+        if columns is None:
+            return None
+        variance = None if columns.variance is None else columns.variance * both**2
+        return ReflectanceColumns(columns.mean * both, variance, columns.measured)
+
+    def leaving(self, vertices: Sequence[int] | NDArray[np.int64], area: F64) -> F64 | None:
+        """(L, n, V) share of the light that arrives over the hat functions of these vertices from all directions, and
+        leaves over that of every vertex; None where a term does not state it. area: (V,) mm^2 of the hat functions.
+        """
+        parts = [term.throughput(vertices, area) for term in self.terms]
+        known = [part for part in parts if part is not None]
+        return sum(known[1:], known[0]) * self.boundary.mean_transmittance**2 if len(known) == len(parts) else None
 
     def of_lasers(self, lasers: Sequence[int]) -> Self:
         """The model with these lasers, in this order; a laser may stand in it more than once."""

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Self, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from hw.base.arrays import F32, I64, Bool
+from hw.base.arrays import F32, F64, I64, Bool
 from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 
 
@@ -29,8 +29,8 @@ class Axes:
 
 @dataclass(frozen=True)
 class ReflectanceColumns:
-    """R_d from n vertices to all V. mean: (L, n, V) mm^-2; variance: the same shape, mm^-4, or None where a method
-    states none; measured: (n, V) entries that samples support
+    """R_d from n vertices to all V, or exitance per irradiance. mean: (L, n, V) mm^-2; variance: the same shape, mm^-4,
+    or None where a method states none; measured: (n, V) entries that samples support
     """
 
     mean: NDArray[np.floating]
@@ -48,9 +48,22 @@ class Term(ABC):
     def image(self, light: LightOnMesh, view: ViewOfMesh) -> F32:
         """(L, H, W) radiance in W/(mm^2 sr) that the term adds, averaged over each pixel."""
 
+    def image_variance(self, light: LightOnMesh, view: ViewOfMesh) -> F32 | None:
+        """(2, L, H, W) variance of `image` by that of the term's entries, as if their errors were independent, and as
+        if they were all alike; None where the term states none.
+        """
+        return None
+
     def reflectance_columns(self, vertices: Sequence[int] | I64) -> ReflectanceColumns | None:
         """The term's part of R_d from these vertices to all; None where it states none between different points."""
         return None
+
+    def throughput(self, vertices: Sequence[int] | I64, area: F64) -> F64 | None:
+        """(L, n, V) share of the flux transmitted at these vertices that comes up again around every vertex, F of the
+        thesis (2.4); None where the term does not state it. area: (V,) mm^2 of the hat functions.
+        """
+        columns = self.reflectance_columns(vertices)
+        return None if columns is None else np.asarray(columns.mean * area, np.float64)
 
     @property
     def lasers(self) -> int:

@@ -72,7 +72,11 @@ class ViewOfMesh:
         value, pixel, vertex = (np.concatenate([getattr(s, name) for s in sums]) for name in ("data", "row", "col"))
         return sparse.csr_matrix((value, (pixel, vertex)), shape=shape)
 
-    def image(self, radiosity: F64) -> F32:
-        """(L, V) radiosity in W/mm^2 -> (L, H, W) radiance in W/(mm^2 sr), averaged over each pixel."""
-        flat = np.asarray(self.matrix @ np.asarray(radiosity, np.float64).T)
+    def image(self, radiosity: F64, squared: bool = False) -> F32:
+        """(L, V) radiosity in W/mm^2 -> (L, H, W) radiance in W/(mm^2 sr), averaged over each pixel.
+
+        squared: the radiosity's variance at the vertices -> that of the radiance, for independent errors
+        """
+        matrix = self.matrix.power(2) if squared else self.matrix
+        flat = np.asarray(matrix @ np.asarray(radiosity, np.float64).T)
         return np.moveaxis(flat.reshape(self.camera.height, self.camera.width, -1), -1, 0).astype(np.float32)

@@ -1,4 +1,4 @@
-"""How well a relit image or an R_d agrees with the truth, when the truth is itself a Monte Carlo estimate.
+"""How well a relit image agrees with a reference that is itself a Monte Carlo estimate.
 
 Two independent halves A and B of a reference have errors that are uncorrelated with each other, so that products such
 as (I - A)(I - B) hold the model's error and not the reference's noise. Nothing is clipped: a model better than the
@@ -150,57 +150,3 @@ def score_halves(images: ArrayLike, halves: ArrayLike, mask: Bool) -> HalvesScor
     noise = _block_sums(2 * (error * (e - d) + nrmse2 * mean * e), mask)
     se2 = float(np.sqrt((noise**2).sum())) / denominator
     return HalvesScore(signed_root(nrmse2), 0.5 * (signed_root(nrmse2 + se2) - signed_root(nrmse2 - se2)))
-
-
-@dataclass(frozen=True)
-class DecadeScore:
-    """Of an R_d against the truth, over the entries whose truth lies in one decade below the peak.
-
-    decade:      0 for (peak/10, peak], -1 for the next, ...
-    log10_rmse:  root mean square of log10(estimate / truth) over the covered entries, the truth's own noise removed
-                 (signed root); log10_bias: the mean; None where no entry is covered
-    coverage:    share of the decade's entries that the estimate covers
-    entries:     number of entries of the decade
-    """
-
-    decade: int
-    log10_rmse: float | None
-    log10_bias: float | None
-    coverage: float
-    entries: int
-
-
-def score_reflectance(
-    estimate: ArrayLike, truth: ArrayLike, truth_se: ArrayLike, covered: ArrayLike, decades: int = 4
-) -> tuple[DecadeScore, ...]:
-    """log10_rmse per decade below the peak of each wavelength, wavelengths pooled.
-
-    estimate, truth, truth_se: (L, n, V) in mm^-2; covered: bool, broadcast to the same shape. A covered estimate that
-    is not positive counts as one decade off. Entries whose truth is known to worse than a half are left out.
-    """
-    e, t, se = (np.asarray(x, np.float64) for x in (estimate, truth, truth_se))
-    seen = np.broadcast_to(np.asarray(covered, bool), t.shape)
-    usable = (t > 0) & (se < 0.5 * t)
-    if not usable.any():
-        raise Unscorable("no entry of the truth is known to better than a half")
-    peak = np.where(usable, t, 0.0).max(axis=tuple(range(1, t.ndim)), keepdims=True)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        below = np.where(usable, np.log10(peak / t), np.inf)
-        off = np.where(e > 0, np.log10(e / t), -1.0)
-        noise2 = (se / (t * math.log(10))) ** 2
-    scores = []
-    for decade in range(decades):
-        of_decade = usable & (below >= decade) & (below < decade + 1)
-        chosen = of_decade & seen
-        entries, count = int(np.count_nonzero(of_decade)), int(np.count_nonzero(chosen))
-        removed = float(noise2[chosen].mean()) if count else 0.0
-        scores.append(
-            DecadeScore(
-                decade=-decade,
-                log10_rmse=signed_root(float((off[chosen] ** 2).mean()) - removed) if count else None,
-                log10_bias=float(off[chosen].mean()) if count else None,
-                coverage=count / entries if entries else 0.0,
-                entries=entries,
-            )
-        )
-    return tuple(scores)

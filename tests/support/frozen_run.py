@@ -68,12 +68,11 @@ def write_frozen_run(root: Path) -> np.ndarray:
     exact = np.stack([pairs.mean(lambda d, k=k: reflectance(d, k)) for k in range(2)])
     exact = 0.5 * (exact + exact.transpose(0, 2, 1))
     balance = EnergyBalance(**{name: np.ones(2) for name in EnergyBalance.__dataclass_fields__})
-    error = 0.01 * exact[:, columns]
-    Truth(columns, exact[:, columns], error, RayMesh.of(experiment.scan).vertex_areas, balance).save(
-        folder.twin / "truth.npz"
-    )
     term = GlobalTerm(exact.astype(np.float32), np.ones(exact.shape[1:], bool))
     model, noise = RelightableModel(experiment.scan, Boundary(1.3), (term,)), np.random.default_rng(1)
+    entries = model.exitance_columns(columns)
+    replicates = (entries.mean * (1 + 0.03 * noise.standard_normal((8, *entries.mean.shape)))).astype(np.float32)
+    Truth(columns, replicates, RayMesh.of(experiment.scan).vertex_areas, balance).save(folder.twin / "truth.npz")
     for light in scene.relight.lights:
         for view in scene.relight.views:
             image = model.image(model.lit_by(light), model.seen_by(PinholeCamera.from_config(view)))

@@ -18,6 +18,9 @@ LIGHTS = ("uniform", "directional", "edge", "behind", "projector", "spot", "envi
 DECADES = ("0", "-1", "-2", "-3")
 
 
+ERRORS = {"independent": 12.0, "alike": 0.6}
+
+
 SECONDS = {"scan": 2.0, "capture": 95.0, "truth": 40.0, "references": 0.3, "pipeline": 30.0, "scores": 2.0}
 
 
@@ -47,6 +50,25 @@ def fake_data() -> ReportData:
             }
             for m in ("default", "disco2004")
         },
+        totals={
+            m: {
+                "lit": {
+                    "columns": 20,
+                    "mean": [1.01] * 3,
+                    "mean_se": [0.01] * 3,
+                    "spread": [0.05] * 3,
+                    "spread_se": [0.008] * 3,
+                },
+                "unlit": {
+                    "columns": 1,
+                    "mean": [0.92] * 3,
+                    "mean_se": [None] * 3,
+                    "spread": [None] * 3,
+                    "spread_se": [None] * 3,
+                },
+            }
+            for m in METHODS
+        },
         seconds={"default": 24.0, "disco2004": 21.0, "dipole": 3.0, "lambertian": 1.0},
         balance={
             "specular": (0.06,) * 3,
@@ -72,7 +94,8 @@ def fake_images(random: np.random.Generator, r2: np.ndarray) -> tuple[list[Compa
         for method, error in METHODS.items():
             row: dict[str, object] = {"light": light, "view": view, "method": method}
             row["nrmse"] = error * random.uniform(0.7, 1.4)
-            rows.append({**row, "nrmse_se": 0.004, "nrmse_floor": 0.02, "psnr": 31.2, "energy_ratio": 1.01})
+            row |= {"nrmse_se": 0.004, "nrmse_floor": 0.02, "psnr": 31.2, "energy_ratio": 1.01}
+            rows.append({**row, "rim_nrmse": 3 * error, "rim_nrmse_se": 0.02})
     return comparisons, rows
 
 
@@ -96,7 +119,29 @@ def fake_summary(rows: list[dict[str, object]]) -> dict[str, object]:
         "relit": rows,
         "reflectance": {
             "log10_rmse_by_decade": {d: 0.05 + 0.1 * k for k, d in enumerate(DECADES)},
+            "log10_rmse_all_by_decade": {d: 0.1 + 0.1 * k for k, d in enumerate(DECADES)},
             "coverage_by_decade": {d: 0.9 - 0.15 * k for k, d in enumerate(DECADES)},
+            "totals": None,
+        },
+        "z": {
+            "entries": {d: {"count": 400, "rms": 1.2, "beyond_3": 0.01} for d in DECADES},
+            "totals": {
+                name: {errors: {"count": 60, "rms": rms, "beyond_3": 0.2} for errors, rms in ERRORS.items()}
+                for name in ("lit", "unlit")
+            },
+            "pixels": {
+                light: {errors: {"count": 9000, "rms": rms, "beyond_3": 0.2} for errors, rms in ERRORS.items()}
+                for light in LIGHTS
+            },
+        },
+        "neck": {
+            direction: {
+                "columns": 9,
+                "truth": [0.02] * 3,
+                "truth_se": [0.001] * 3,
+                "methods": {"default": [0.03] * 3, "lambertian": [0.0] * 3},
+            }
+            for direction in ("along_normal", "against_normal")
         },
         "left_out": [
             {"what": "pose search", "because": "the poses are those of the nominal rig, and <deviation> is off"}

@@ -52,13 +52,13 @@ from disco_twin.experiment.keys import code_key
 from disco_twin.run.stages import CODE
 print(json.dumps({stage: code_key(*modules) for stage, modules in CODE.items()}))
 """
-HALF = """
+QUARTER = """
 
-_whole = mean_transmittance
+_whole = hat_areas
 
 
-def mean_transmittance(eta: float) -> float:
-    return _whole(eta) / 2
+def hat_areas(transport, basis):
+    return _whole(transport, basis) / 4
 """
 
 
@@ -85,14 +85,14 @@ def stages_done(project: Path) -> set[str]:
 
 
 def test_truth_is_computed_again_when_what_it_imports_has_changed_and_only_then(project: Path) -> None:
-    """Truth divides by the square of the mean transmittance: with half of it, the truth of before is four times off."""
+    """Truth divides by the areas of hat functions: with a quarter of them, the truth of before is four times off."""
     truth = project / "out" / "twin" / "truth.npz"
     assert stages_done(project) == {"scan", "capture", "truth", "references"}
     before, captured = Truth.load(truth), (project / "out" / "capture" / "images.bin").stat()
-    with (project / "pipeline" / "geometry" / "fresnel.py").open("a") as file:
-        file.write(HALF)
+    with (project / "disco_twin" / "light" / "truth.py").open("a") as file:
+        file.write(QUARTER)
     assert stages_done(project) == {"truth"}
-    np.testing.assert_allclose(Truth.load(truth).mean, 4 * before.mean)
+    np.testing.assert_allclose(Truth.load(truth).mean, 4 * before.mean, rtol=1e-6)
     for not_imported in ("disco_twin/report/page.py", "disco_twin/evaluate/summary.py", "pipeline/relight/scores.py"):
         with (project / not_imported).open("a") as file:
             file.write("CHANGED = True\n")
@@ -104,9 +104,9 @@ def test_a_changed_function_is_in_the_keys_of_the_stages_that_depend_on_it(proje
     """By the keys of a stage's code alone, of which the stages' own are made."""
     before = json.loads(run_in(project, KEYS))
     for module, function, again in (
-        ("camera/lars3", "lars3_sensor", {"scan", "targets", "capture"}),
+        ("camera/lars3", "lars3_sensor", {"scan", "targets", "capture", "budget"}),
         ("light/sources", "light_source", set(before) - {"targets", "pipeline"}),
-        ("light/references", "render_reference", {"references", "scores"}),
+        ("light/references", "render_reference", {"references", "scores", "budget"}),
     ):
         with (project / "disco_twin" / f"{module}.py").open("a") as file:
             file.write(

@@ -81,7 +81,7 @@ def summary(run_folder: Path) -> dict[str, Any]:
 def test_summary_has_exactly_what_the_design_says(summary: dict[str, Any]) -> None:
     assert set(summary) == {
         "format_version", "scene", "seed", "method", "stages", "capture", "calibration", "simulation_noise", "relit",
-        "reflectance", "left_out",
+        "z", "reflectance", "left_out",
     }  # fmt: skip
     assert summary["format_version"] == 1
     assert (summary["scene"], summary["seed"], summary["method"]) == ("quick", 1, "default")
@@ -93,7 +93,13 @@ def test_summary_has_exactly_what_the_design_says(summary: dict[str, Any]) -> No
     assert (capture["views"], capture["spots"], capture["wavelengths"]) == (6, 75, 3)
     assert capture["images"] == 6 + 2 * 3 * 75
     assert 0 < capture["bytes_stored"] < capture["bytes_raw"]
-    assert set(summary["reflectance"]["coverage_by_decade"]) == {"0", "-1", "-2", "-3"}
+    for key in ("log10_rmse_by_decade", "log10_rmse_all_by_decade", "coverage_by_decade"):
+        assert set(summary["reflectance"][key]) == {"0", "-1", "-2", "-3"}
+    totals = summary["reflectance"]["totals"]
+    assert totals["lit"]["columns"] + totals["unlit"]["columns"] == 4
+    assert [len(totals[part][key]) for part in totals for key in ("mean", "mean_se", "spread", "spread_se")] == [3] * 8
+    assert set(summary["z"]) == {"entries", "totals", "pixels"}
+    assert all(0 < z["rms"] < 100 for z in summary["z"]["pixels"]["uniform"].values())
     assert all(set(item) == {"what", "because"} for item in summary["left_out"])
 
 
@@ -108,6 +114,7 @@ def test_every_light_view_and_method_is_scored(summary: dict[str, Any]) -> None:
     for row in rows:
         assert np.isfinite(row["nrmse"])
         assert row["nrmse_se"] >= 0
+        assert row["rim_nrmse_se"] is None or row["rim_nrmse_se"] >= 0
 
 
 def test_the_default_method_relights_and_beats_the_lambertian(summary: dict[str, Any]) -> None:

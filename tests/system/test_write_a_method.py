@@ -63,11 +63,12 @@ def run(followed: tuple[Path, np.ndarray]) -> OpenedRun:
 
 def test_the_page_s_method_is_scored_beside_the_baselines(run: OpenedRun) -> None:
     assert list(run.models) == ["flat", "dipole", "lambertian"]
-    assert run.scores.sizes == {"model": 3, "light": 2, "view": 2, "decade": 4}
+    assert run.scores.sizes == {"model": 3, "light": 2, "view": 2, "decade": 4, "columns": 2, "laser": 2}
     assert (run.folder.root / "report.html").is_file()
     nrmse = run.scores.nrmse
     assert (nrmse.sel(model="flat", light="directional") < nrmse.sel(model="lambertian", light="directional")).all()
     assert np.isnan(run.scores.log10_rmse_completed.sel(model="lambertian")).all()  # it states no R_d
+    assert (abs(run.scores.totals_mean.sel(model="lambertian") - 1) < 0.1).all()
     with pytest.raises(KeyError, match="'default' was not reconstructed here, only flat, dipole, lambertian"):
         run.models["default"]
 
@@ -89,17 +90,24 @@ def test_arrays_have_names_and_units(run: OpenedRun) -> None:
         assert np.isfinite(image.where(mask, 0.0)).all()
 
 
-def test_true_reflectance_scores_nothing_but_noise(followed: tuple[Path, np.ndarray], run: OpenedRun) -> None:
-    """Rationale: the references are this model's images with 2 % of noise a half, which a score removes."""
+def test_a_perfect_model_scores_nothing_but_noise(followed: tuple[Path, np.ndarray], run: OpenedRun) -> None:
+    """Rationale: the references are this model's images with 2 % of noise a half, the truth its columns with 1 %; a
+    score removes either.
+    """
     exact = followed[1]
-    np.testing.assert_array_equal(run.truth.reflectance, exact[:, run.truth.vertex_in])
     term = GlobalTerm(exact.astype(np.float32), np.ones(exact.shape[1:], bool))
     model = RelightableModel(run.experiment.scan, Boundary(1.3), (term,))
+    entries = model.exitance_columns(run.truth.vertex_in.values).mean
+    np.testing.assert_allclose(run.truth.exitance, entries, rtol=0.06)
     scores = run.score(model, "exact").sel(model="exact")
     assert (abs(scores.nrmse) < NOISE / 4).all()  # a pixel's noise over hundreds of pixels
     assert ((scores.nrmse_floor > NOISE / 2) & (scores.nrmse_floor < NOISE)).all()  # that of the halves' mean
     assert (abs(scores.energy_ratio - 1) < 4 * NOISE / np.sqrt(2 * 200)).all()
     assert float(scores.coverage.sel(decade=0)) == 1
+    # 1 % is .0046 in log10; what is left of it after removal, over some hundred entries a decade, is a quarter at most
+    assert (abs(scores.log10_rmse_completed.dropna("decade")) < 0.0046 / 2).all()
+    assert (abs(scores.totals_mean - 1) < 4 * 0.01 / np.sqrt(80)).all()
+    assert (abs(scores.totals_spread) < 0.01).all()
 
 
 def test_images_are_read_at_random(run: OpenedRun) -> None:

@@ -39,14 +39,16 @@ def perfect() -> tuple[StageOutputs, TrueRun]:
     mean = np.stack([np.exp(-distance / length) / length**2 for length in (3.0, 4.0, 5.0)])
     zero: Any = np.zeros(3)
     balance = EnergyBalance(**dict.fromkeys(EnergyBalance.__dataclass_fields__, zero))
-    truth = Truth(COLUMNS, mean, 1e-6 * mean, RayMesh.of(scan).vertex_areas, balance)
+    replicates = mean * (1 + 1e-7 * np.resize([-1, 1], 8)[:, None, None, None])
+    truth = Truth(COLUMNS, replicates, RayMesh.of(scan).vertex_areas, balance)
     values = np.full((3, len(plan.spots), len(scan.vertices)), np.nan)
     values[:, :, COLUMNS] = np.stack([beam_footprints(scan, spots) @ column.T for column in mean])
+    lit = np.arange(len(COLUMNS)) % 2 == 0
     image = np.random.default_rng(1).uniform(1.0, 2.0, (3, 12, 16))
     hits = np.where(spots.transmitted[:, None] > 0, spots.position, np.nan)
     key, mask = ("uniform", "left"), np.ones((12, 16), bool)
     true = TrueRun(scan, plan, calibration, hits, truth, {key: np.stack([image, image])}, {"left": mask})
-    return StageOutputs(calibration, spots, values, mean, {key: image}), true
+    return StageOutputs(calibration, spots, values, mean, lit, {key: image}), true
 
 
 def moved(calibration: Calibration, views: F64, projectors: F64) -> Calibration:
@@ -115,7 +117,7 @@ def test_errors_of_spots_samples_entries_and_images_have_their_size() -> None:
     assert all(name.startswith("samples/") for name in found)  # they are then said of other places
     for stage, change in (
         ("samples", {"values": 10**0.1 * outputs.values}),
-        ("completion", {"reflectance": 10**0.1 * outputs.reflectance}),
+        ("completion", {"exitance": 10**0.1 * outputs.exitance}),
     ):
         found = changed(**change)
         assert found == dict.fromkeys(found, pytest.approx(0.1, abs=1e-4))
@@ -123,6 +125,17 @@ def test_errors_of_spots_samples_entries_and_images_have_their_size() -> None:
         assert all(name.startswith(stage) for name in found)
     found = changed(images={key: 1.1 * image for key, image in outputs.images.items()})
     assert found == dict.fromkeys(("relit/uniform@left nrmse", "relit/uniform@left energy - 1"), pytest.approx(0.1))
+
+
+def test_totals_that_scatter_and_are_too_low_show_both() -> None:
+    """Lit columns by turns a tenth too high and a tenth too low; unlit ones a tenth too low."""
+    outputs, _ = perfect()
+    factor = np.where(outputs.lit, np.where(np.arange(len(COLUMNS)) % 4 == 0, 1.1, 0.9), 0.9)
+    found = changed(exitance=outputs.exitance * factor[:, None])
+    assert found["completion/lit totals spread"] == pytest.approx(0.1, rel=0.1)
+    assert abs(found.get("completion/lit totals log10 bias", 0.0)) < 0.01
+    assert found["completion/unlit totals log10 bias"] == pytest.approx(np.log10(0.9), abs=1e-6)
+    assert "completion/unlit totals spread" not in found
 
 
 def test_what_was_not_observed_or_is_not_positive_is_no_perfect_sample() -> None:

@@ -17,10 +17,13 @@ from rich.console import Console
 from scene_fakes import sphere
 
 from disco_twin.cli.tables import score_table
-from disco_twin.evaluate.scores import KEPT, usable_score
+from disco_twin.evaluate.scores import KEPT, RIM, usable_score
+from disco_twin.experiment.experiment import Experiment
+from disco_twin.experiment.pipeline_process import pipeline_inputs
 from disco_twin.report.collect import SPOTS_SHOWN, impulses
 from disco_twin.report.page import render
-from disco_twin.run.scan import write_scan
+from disco_twin.run.scan import require_capturable, write_scan
+from disco_twin.scene.scene import Neck
 from hw.base.errors import InputError
 from pipeline.geometry.nominal_rig import CameraConfig
 from pipeline.stream.stream import StreamReader
@@ -42,10 +45,11 @@ def test_what_cannot_be_scored_is_none_with_a_warning(caplog: pytest.LogCaptureF
 
 def test_the_report_and_the_table_show_a_dash_where_there_is_no_score() -> None:
     data = fake_data()
-    rows = [r | (dict.fromkeys(KEPT) if r["light"] == "edge" else {}) for r in data.summary["relit"]]
+    none = dict.fromkeys((*KEPT, *(f"rim_{key}" for key in RIM)))
+    rows = [r | (none if r["light"] == "edge" else {}) for r in data.summary["relit"]]
     data = replace(data, summary={**data.summary, "relit": rows}, impulses=(), comparisons=(), distance=None)
     page = render(data)
-    assert "<tr><td>edge</td>" + "<td>-</td>" * len(METHODS) + "<td>- / -</td><td>-</td></tr>" in page
+    assert "<tr><td>edge</td>" + "<td>-</td>" * len(METHODS) + "<td>- / -</td><td>-</td>\n<td>-</td></tr>" in page
     assert "nan" not in page.split("<h2>Errors</h2>")[1].split("<figure>")[0]
     page = render(replace(data, summary={**data.summary, "relit": [r | dict.fromkeys(KEPT) for r in rows]}))
     assert "<b>-</b><span>nrmse under broad light" in page
@@ -84,6 +88,20 @@ def test_a_held_out_view_must_see_the_object(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"relight\.views\[1\].*'c' does not see the object|does not see.*views\[1\]"):
         write_scan(sphere(aim=(450.0, 0.0, 500.0)), tmp_path)
     assert not any(tmp_path.iterdir())
+
+
+def test_a_neck_lies_in_the_object() -> None:
+    def with_neck(height: float) -> Experiment:
+        scene = sphere().scene
+        neck = Neck(through_mm=(0.0, 0.0, height))
+        return Experiment(scene.model_copy(update={"relight": scene.relight.model_copy(update={"neck": neck})}))
+
+    with pytest.raises(InputError, match=r"relight\.neck\.through_mm.*allowed: inside \[-20.*Remedy"):
+        require_capturable(with_neck(25.0))
+    inside = with_neck(12.0)
+    np.testing.assert_array_equal(inside.beyond_neck, inside.scan.vertices[:, 2] > 12.0)
+    assert "neck" not in pipeline_inputs(inside.scene, ("default",))["relight"]
+    assert sphere().beyond_neck is None
 
 
 def test_the_pipeline_is_not_told_which_faults_are_on(tmp_path: Path) -> None:

@@ -26,6 +26,8 @@ def test_the_page_is_self_contained_and_complete(tmp_path: Path) -> None:
         "Relit images",
         "Errors",
         "Diffuse subsurface",
+        "Head and body",
+        "z-scores",
         "Calibration",
         "Time, memory",
         "left out",
@@ -33,6 +35,8 @@ def test_the_page_is_self_contained_and_complete(tmp_path: Path) -> None:
         assert heading in page
     assert page.count("<img") == len(LIGHTS) + 7
     assert "pose search" in page
+    assert "<tr><td>along normal</td><td>9</td><td>0.020 ± 0.001, 0.020 ± 0.001, 0.020 ± 0.001</td>" in page
+    assert "<td>totals of lit columns</td><td>independent</td><td>60</td><td>12.00</td>" in page
     assert "quick &lt;&amp;&gt;" in page
     assert "<deviation>" not in page
     assert len(page) < 12e6
@@ -42,6 +46,8 @@ def test_a_run_with_little_to_show_still_gets_its_page() -> None:
     data = fake_data()
     summary = {**data.summary, "relit": [], "left_out": []}
     summary["reflectance"] = {"log10_rmse_by_decade": {}, "coverage_by_decade": {}}
+    summary["z"] = None
+    del summary["neck"]
     page = render(ReportData(summary=summary, wavelengths_nm=(635.0,), main="default"))
     assert "Nothing: this scene needs every step" in page
 
@@ -166,5 +172,5 @@ def test_text_from_files_is_escaped_wherever_it_stands() -> None:
     page = render(replace(data, notes=[HOSTILE], decades={}, truth=None, balance={}))
     assert "<script" not in page
     assert f'alt="{ESCAPED}"' in page
-    places = {"head": 4, "relit": 2, "errors": 6, "calibration": 2, "left out": 2}
+    places = {"head": 4, "relit": 2, "errors": 7, "neck": 1, "z": 1, "calibration": 2, "left out": 2}
     assert page.count(ESCAPED) == sum(places.values())

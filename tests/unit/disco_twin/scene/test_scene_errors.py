@@ -52,6 +52,13 @@ BAD = [
     ),
     ("[scan]", '[relight]\nlights = ["moon"]\n[scan]', ["relight.lights", "unknown light 'moon'", "uniform"]),
     ("[scan]", '[[relight.lights]]\nkind = "uniform"\ncolour = [1.0]\n[scan]', ["relight.lights", "3 values"]),
+    ("[scan]", "[relight.neck]\nthrough_mm = [0.0, 0.0]\n[scan]", ["relight.neck.through_mm"]),
+    ("[scan]", "[relight.neck]\nnormal = [0.0, 0.0, 1.0]\n[scan]", ["relight.neck.through_mm", "missing"]),
+    (
+        "[scan]",
+        "[relight.neck]\nthrough_mm = [0.0, 0.0, 1.0]\nnormal = [0.0, 0.0, 0.0]\n[scan]",
+        ["relight.neck.normal", "zero"],
+    ),
     ('kind = "hollow"\nradius_mm = 3.0', 'kind = "crack"\nsigma_t_per_mm = 1.0\nnormal = [0.0, 0.0, 0.0]', ["normal"]),
 ]
 

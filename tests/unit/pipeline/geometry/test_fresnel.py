@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from pipeline.geometry.fresnel import mean_transmittance, transmittance
+from pipeline.geometry.fresnel import Boundary, mean_transmittance, transmittance
 
 
 def textbook(cosine: float, eta: float) -> float:
@@ -50,3 +52,18 @@ def test_hemispherical_mean(eta: float) -> None:
 def test_published_mean() -> None:
     assert mean_transmittance(1.3) == pytest.approx(0.939, abs=5e-4)
     assert 1 - mean_transmittance(1.5) == pytest.approx(0.0918, abs=5e-5)  # Egan & Hilgeman 1979
+
+
+@pytest.mark.parametrize("eta", [1.0, 1.00002, 1.001, 1.3, 1.5, 3.0])
+def test_mean_of_a_measured_boundary(eta: float) -> None:
+    """Rationale: scipy's adaptive quadrature of the same integrand, piece by piece between the ratio's corners."""
+    boundary = Boundary(eta, (0.025, 0.075, 0.3, 0.8, 0.95), (3.7, 1.87, 0.6, 1.2, 0.9))
+
+    def flux(cosine: float) -> float:
+        return 2 * cosine * float(transmittance(cosine, boundary))
+
+    ends = (0, 1e-4, 1e-2, *boundary.cosines, 1)
+    exact = sum(quad(flux, a, b, epsabs=1e-13)[0] for a, b in pairwise(ends))
+    assert boundary.mean_transmittance == pytest.approx(exact, abs=2e-8 if eta < 1.001 else 1e-10)  # closed form's own
+    assert Boundary(eta).mean_transmittance == mean_transmittance(eta)
+    assert Boundary(eta, (0.5,), (1.1,)).mean_transmittance == pytest.approx(1.1 * mean_transmittance(eta), rel=1e-14)

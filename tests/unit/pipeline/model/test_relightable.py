@@ -75,6 +75,50 @@ def test_a_lambertian_surface_is_a_diagonal_matrix() -> None:
     assert other.max() > 0
 
 
+def test_what_leaves_is_tbar_squared_times_throughput() -> None:
+    """Rationale: Tbar of light arriving from all directions enters; of what comes up, Tbar leaves; a Lambertian part
+    gives back where it was lit.
+    """
+    term, albedo, area = dense(), opaque(), RayMesh.of(MESH).vertex_areas
+    both = BOUNDARY.mean_transmittance**2
+    assert both > Boundary(1.3).mean_transmittance ** 2
+    leaving = model(term, albedo).leaving([3, 5], area)
+    assert leaving is not None
+    expected = both * term.reflectance[:, [3, 5]] * area
+    for n, u in enumerate([3, 5]):
+        expected[:, n, u] += both * albedo.albedo[:, u]
+    np.testing.assert_allclose(leaving, expected, rtol=1e-6)
+    columns = model(term, albedo).exitance_columns([3, 5])
+    assert columns is not None
+    np.testing.assert_allclose(columns.mean, both * term.reflectance[:, [3, 5]], rtol=1e-6)
+    np.testing.assert_allclose(columns.variance, both**2 * term.variance[:, [3, 5]], rtol=1e-6)
+    assert model(albedo).exitance_columns([3]) is None
+
+
+def test_the_variance_of_an_image_is_that_of_its_entries() -> None:
+    """Rationale: models drawn from the stated variances, every entry apart or all together. Expected: the scatter of
+    their images.
+    """
+    term, rng = dense(), np.random.default_rng(1)
+    of = model(term)
+    light, view = of.lit_by(Directional(direction=(-1, 0.3, 0))), of.seen_by(CAMERA)
+    stated = of.image_variance(light, view)
+    assert stated is not None
+    assert stated.shape == (2, 2, 24, 32)
+    deviation = np.sqrt(term.variance)
+    draws = [light.flux[:, None] @ (deviation * rng.standard_normal(deviation.shape)) for _ in range(400)]
+    scatter = np.var([view.image(d[:, 0]) for d in draws], axis=0)
+    shown = stated[0] > 1e-3 * stated[0].max()
+    assert np.median(scatter[shown] / stated[0][shown]) == pytest.approx(1, abs=0.05)
+    together = view.image((np.abs(light.flux)[:, None] @ deviation)[:, 0])  # all of one sign
+    np.testing.assert_allclose(stated[1], together**2, rtol=1e-4, atol=1e-6 * stated[1].max())
+    assert (stated[1] >= stated[0] * (1 - 1e-5)).all()
+    twice = model(term, term).image_variance(light, view)
+    np.testing.assert_allclose(twice, np.stack([2 * stated[0], 4 * stated[1]]), rtol=1e-5)
+    assert model(opaque()).image_variance(light, view) is None
+    assert model(term, opaque()).image_variance(light, view) is None
+
+
 def test_a_file_gives_the_same_model(tmp_path: Path) -> None:
     made = model(dense(), opaque(), dense(1, variance=False))
     made.save(tmp_path / "model.npz")
