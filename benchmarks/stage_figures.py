@@ -38,7 +38,8 @@ from disco_twin.light.references import LAYERS, load_reference
 from disco_twin.light.truth import Truth
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
 from pipeline.geometry.fresnel import mean_transmittance
-from pipeline.geometry.mesh import RayMesh, read_scan
+from pipeline.geometry.mesh import RayMesh
+from pipeline.geometry.mesh_file import read_scan
 from pipeline.plan.plan import Plan
 from pipeline.reconstruct.samples.distances import beam_footprints
 from pipeline.reconstruct.samples.samples_file import load_samples

@@ -37,7 +37,7 @@ from pipeline.calibrate.figures import figures
 from pipeline.calibrate.target_images import has_targets
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import Boundary
-from pipeline.geometry.mesh import read_scan
+from pipeline.geometry.mesh_file import read_scan
 from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
 from pipeline.model.relightable import RelightableModel
 from pipeline.plan.targets import FOLDER
@@ -144,7 +144,7 @@ def run(capture: Path, work: Path, request: Request, given: Path | None = None) 
     with stages.stage("calibration"):
         rig = read_json(capture / "rig.json", NominalRigFile, CAPTURE_AGAIN).rig
         sensor = read_json(capture / "sensor.json", SensorFile, CAPTURE_AGAIN).sensor
-        mesh = read_scan(capture / "scan.ply")
+        mesh = read_scan(capture / "scan.ply", CAPTURE_AGAIN)
         calibration, calibrated = calibrate(capture, rig, sensor, mesh, given)
         calibration.save(work / "calibration.json")
     samples, statistics = gather(capture, calibration, mesh, settings, stages)

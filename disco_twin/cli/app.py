@@ -102,6 +102,21 @@ def import_(
 
 
 @app.command()
+def mesh(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="A mesh or scan: PLY, OBJ or STL.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The PLY file that is written.")],
+    size_mm: Annotated[
+        float | None, typer.Option(help="Scale it to this largest extent and centre it; left out, both are kept.")
+    ] = None,
+) -> None:
+    """Close a mesh and orient it outward, and report what that changed. Needs no renderer."""
+    from disco_twin.object.mesh_repair import mend
+
+    for name, figure in mend(source, out, size_mm).lines():
+        console.print(f"  {name:<12} {figure}", highlight=False, soft_wrap=True)
+
+
+@app.command()
 def quality(
     capture_folder: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture: DIR/capture of a run.")],
 ) -> None:

@@ -11,10 +11,12 @@ from disco_twin.object import shapes
 from disco_twin.object.blend import blend
 from disco_twin.object.extrusion import extrusion
 from disco_twin.object.media import Medium, build_medium
-from disco_twin.object.mesh import check_size, hat_basis, read_mesh, remesh
+from disco_twin.object.mesh import hat_basis, read_mesh
+from disco_twin.object.remesh import remesh
 from disco_twin.object.scanner import scan_points
 from disco_twin.scene.object_schema import MOST_VERTICES, Blend, Box, Extrusion, MeshFile, Pebble, Shape, Sphere, Torus
 from hw.base.errors import InputError
+from pipeline.geometry.mesh_file import require_size
 from pipeline.geometry.surface_from_points import reconstruct_surface
 
 if TYPE_CHECKING:
@@ -71,7 +73,7 @@ def build_scan(scene: Scene, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     if scene.rig.faults.scanner:
         return reconstruct_surface(*scan_points(mesh, scene.seed), vertices)
     if isinstance(shape, Box):
-        return shapes.box(shape, triangles=2 * vertices)  # keeps the edges sharp
+        return shapes.box(shape, triangles=2 * vertices)  # also of a slab that is thinner than an edge is long
     if isinstance(shape, Extrusion):
         return extrusion(shape, triangles=2 * vertices)
     return remesh(mesh, vertices)
@@ -93,5 +95,5 @@ def _mesh(shape: Shape) -> trimesh.Trimesh:
             mesh = blend(shape)
         case Extrusion():
             mesh = extrusion(shape)
-    check_size(mesh, "object.shape")
+    require_size(mesh, None, "object.shape")
     return mesh

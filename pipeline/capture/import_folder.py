@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import trimesh
 from PIL import Image, UnidentifiedImageError
 from pydantic import Field
 
@@ -30,6 +29,7 @@ from hw.base.errors import InputError
 from hw.camera.bracket import Bracket
 from hw.interface import Aim
 from hw.record import Sensor
+from pipeline.geometry.mesh_file import read_scan
 from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.plan.plan import ImageAddress, Plan
 from pipeline.records import write_capture_records
@@ -75,6 +75,7 @@ def import_capture(folder: Path, out: Path, progress: Callable[[int, int], None]
     """
     what = "a capture.toml (docs/lab.md, section 6, shows one)"
     described = load_toml(folder / "capture.toml", CaptureDescription, what)
+    scan = bytes(read_scan(described.scan).export(file_type="ply"))
     table = folder / "images.csv"
     brackets = _read_table(table, described)
     plan = _plan(table, described.rig, brackets)
@@ -82,7 +83,7 @@ def import_capture(folder: Path, out: Path, progress: Callable[[int, int], None]
     exponents = tuple(range(sensor.steps))
     bracket = Bracket(sensor.longest_exposure_s, exponents, sensor.bits, described.saturation_dn)
     with StreamWriter(out, plan) as stream:
-        write_capture_records(out, _scan(described.scan), described.rig, sensor)
+        write_capture_records(out, scan, described.rig, sensor)
         for index in range(len(stream), len(plan)):
             address = plan.address(index)
             frames = brackets[_key(plan, address)]
@@ -92,13 +93,6 @@ def import_capture(folder: Path, out: Path, progress: Callable[[int, int], None]
             if progress is not None:
                 progress(index + 1, len(plan))
     return plan
-
-
-def _scan(path: Path) -> bytes:
-    mesh = trimesh.load(path, process=False)
-    if not isinstance(mesh, trimesh.Trimesh):
-        raise InputError("holds no triangles", file=path, remedy="export the scan as PLY, OBJ or STL, in mm")
-    return bytes(mesh.export(file_type="ply"))
 
 
 # ---- the table

@@ -1,4 +1,4 @@
-"""The scanned mesh, its file, and how rays and light meet it: flat faces, hat functions, first hits, shadows (embree).
+"""The scanned mesh, and how rays and light meet it: flat faces, hat functions, first hits, shadows (embree).
 
 The hat function of a vertex is 1 there, 0 at all others and linear on every face.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from pathlib import Path
 
 import gpytoolbox
 import numpy as np
@@ -15,7 +14,6 @@ import trimesh
 from scipy import sparse
 
 from hw.base.arrays import F64, I64, Bool
-from hw.base.errors import InputError
 
 CREASE = np.cos(np.deg2rad(30.0))  # between a vertex's normal and a triangle's
 _OFFSET = 1e-5  # of the mesh's size: shadow rays start this far above the face, far beyond embree's float32
@@ -182,23 +180,3 @@ def _ray_mesh(mesh: trimesh.Trimesh) -> RayMesh:
 def _dot(a: F64, b: F64) -> F64:
     """(N,) products of the rows of two (N, 3)."""
     return np.asarray(np.einsum("ni,ni->n", a, b))
-
-
-def read_scan(path: Path) -> trimesh.Trimesh:
-    """The scanned mesh in mm, vertices as they are numbered in the file.
-
-    Raises: InputError where it cannot be read, or is not a closed surface oriented outward.
-    """
-    again = "delete it, then repeat the capture command"
-    try:
-        mesh = trimesh.load(path, process=False)
-    except Exception as error:  # the loaders raise whatever their parsing trips over
-        why = f" ({error.strerror})" if isinstance(error, OSError) and error.strerror else ""
-        raise InputError(f"not a readable mesh{why}", file=path, remedy=again) from error
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise InputError("holds no triangles", file=path, remedy=again)
-    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices) or not np.isfinite(mesh.vertices).all():
-        raise InputError("the scan's triangles and vertices do not fit", file=path, remedy=again)
-    if not mesh.is_watertight or mesh.volume <= 0:
-        raise InputError("the scan is open or inside out", file=path, remedy="close it and orient its faces outward")
-    return mesh

@@ -17,7 +17,8 @@ from reconstruct_capture import ETA, RADIUS, SENSOR, reflectance, rig, write_cap
 from hw.base.errors import InputError
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
 from pipeline.geometry.fresnel import transmittance
-from pipeline.geometry.mesh import RayMesh, read_scan
+from pipeline.geometry.mesh import RayMesh
+from pipeline.geometry.mesh_file import read_scan
 from pipeline.model.relightable import RelightableModel
 from pipeline.reconstruct.global_term.boundary_fit import measure_boundary
 from pipeline.reconstruct.methods import reconstruct

@@ -18,6 +18,7 @@ from hw.base.errors import InputError
 from hw.camera.bracket import Bracket
 from pipeline.capture.import_folder import COLUMNS, import_capture
 from pipeline.capture.quality import examine
+from pipeline.geometry.mesh_file import read_scan
 from pipeline.records import NominalRigFile, SensorFile
 from pipeline.stream.stream import StreamReader
 
@@ -195,6 +196,41 @@ def test_what_cannot_be_is_refused_in_one_line(
     with pytest.raises(InputError, match=says) as caught:
         import_capture(folder, tmp_path / "ours")
     assert ("\n" not in str(caught.value) and str(folder) in str(caught.value)) or "saturation_dn" in str(caught.value)
+
+
+def scan(change: Callable[[trimesh.Trimesh], None], suffix: str = "ply") -> Callable[[Path], None]:
+    def write_scan(folder: Path) -> None:
+        ball = trimesh.creation.icosphere(subdivisions=1, radius=20)
+        change(ball)
+        ball.export(folder / f"scan.{suffix}")
+        replace("capture.toml", "scan.obj", f"scan.{suffix}")(folder)
+
+    return write_scan
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (scan(lambda m: m.apply_scale(1e-3)), "0.04 mm large.*scale it by 1000 if it is in metres"),
+        (scan(lambda m: m.invert()), "inside out.*`disco-twin mesh .*scan.ply .*scan-closed.ply`"),
+        (scan(lambda m: m.update_faces(np.arange(80) > 0), "stl"), "3 of 120 edges.*`disco-twin mesh .*scan.stl"),
+        (lambda folder: (folder / "scan.obj").write_bytes(b"II*\0junk"), "scan.obj: the mesh is empty"),
+    ],
+)
+def test_a_scan_that_cannot_be_used_is_refused_before_any_frame_is_read(
+    folder: Path, tmp_path: Path, change: Callable[[Path], None], says: str
+) -> None:
+    change(folder)
+    with pytest.raises(InputError, match=says):
+        import_capture(folder, tmp_path / "ours")
+    assert not (tmp_path / "ours").exists()
+
+
+def test_a_scan_as_stl(folder: Path, tmp_path: Path) -> None:
+    scan(lambda m: None, "stl")(folder)
+    import_capture(folder, tmp_path / "ours")
+    mesh = read_scan(tmp_path / "ours" / "scan.ply")
+    assert len(mesh.vertices) == 42 and mesh.volume == pytest.approx(trimesh.creation.icosphere(1, 20).volume, rel=1e-6)
 
 
 def test_duplicate_frames_are_refused(folder: Path, tmp_path: Path) -> None:
