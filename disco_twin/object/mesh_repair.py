@@ -88,8 +88,8 @@ def mend(path: Path, out: Path, size_mm: float | None) -> Mended:
     try:
         check_mesh(new, path)
     except InputError as error:
-        remedy = error.remedy if error.allowed else BY_VOXELS  # of size: the remedy is another one
-        raise error.amended(problem=f"mended, {error.problem}", key=None, remedy=remedy) from error
+        instead = error.remedy if error.allowed else BY_VOXELS  # what is about size has a remedy of its own
+        raise error.amended(problem=f"mended, {error.problem}", key=None, remedy=instead) from error
     write_atomically(out, bytes(new.export(file_type="ply")))
     before = trimesh.util.concatenate(kept)
     before.vertices = scale * np.asarray(before.vertices) + shift
