@@ -9,7 +9,7 @@ import trimesh
 
 from hw.record import RawImage, Sensor
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
-from pipeline.geometry.fresnel import transmittance
+from pipeline.geometry.fresnel import Boundary, transmittance
 from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.nominal_rig import CameraConfig, LaserConfig, ProjectorConfig, RigConfig, SensorConfig
 from pipeline.plan.plan import ImageAddress, Plan, make_plan
@@ -53,8 +53,8 @@ def expose(radiance: np.ndarray, laser: int) -> RawImage:
     return RawImage(exponent, charge.astype(np.uint16))
 
 
-def images(calibration: Calibration, plan: Plan, address: ImageAddress) -> np.ndarray:
-    """(H, W) radiance of the smooth sphere at pixel centres, before the lens."""
+def images(calibration: Calibration, plan: Plan, address: ImageAddress, boundary: float | Boundary = ETA) -> np.ndarray:
+    """(H, W) radiance of the sphere at pixel centres, before the lens."""
     camera = calibration.view_camera(address.view)
     origins, directions = camera.rays(camera.pixel_centres())
     b = (origins * directions).sum(axis=1)
@@ -66,15 +66,17 @@ def images(calibration: Calibration, plan: Plan, address: ImageAddress) -> np.nd
         return np.where(hit, 1e-6, 0.0).reshape(camera.height, camera.width)
     o, d = (x[0] for x in calibration.spot_rays([plan.spots[address.spot]]))
     at = o + d * (-(o @ d) - np.sqrt((o @ d) ** 2 - o @ o + RADIUS**2))
-    entering = transmittance(-(at / RADIUS) @ d, ETA) * POWER[address.laser]
-    leaving = transmittance(-(normal * directions).sum(axis=1), ETA)
+    entering = transmittance(-(at / RADIUS) @ d, boundary) * POWER[address.laser]
+    leaving = transmittance(-(normal * directions).sum(axis=1), boundary)
     r = reflectance(np.linalg.norm(points - at, axis=1), address.laser)
     out = np.where(hit, leaving / np.pi * r * entering, 0.0)
     return np.asarray(out.reshape(camera.height, camera.width))
 
 
-def write_capture(folder: Path, subdivisions: int = 2, scan: trimesh.Trimesh | None = None) -> trimesh.Trimesh:
-    """Everything that the pipeline reads; returns the scan."""
+def write_capture(
+    folder: Path, subdivisions: int = 2, scan: trimesh.Trimesh | None = None, boundary: float | Boundary = ETA
+) -> trimesh.Trimesh:
+    """Everything that the pipeline reads, of a sphere with this boundary; returns the scan."""
     folder.mkdir(parents=True)
     mesh = scan or trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS)
     config = rig()
@@ -84,7 +86,7 @@ def write_capture(folder: Path, subdivisions: int = 2, scan: trimesh.Trimesh | N
         for n, address in enumerate(plan.addresses()):
             aim = plan.spots[address.spot] if address.spot >= 0 else None
             lens = calibration.vignetting(address.view)
-            raw = expose(images(calibration, plan, address) * lens, max(address.laser, 0))
+            raw = expose(images(calibration, plan, address, boundary) * lens, max(address.laser, 0))
             power = POWER[address.laser] if aim else 0.0
             angle = plan.angles_rad[plan.angle_of(address.view)]
             meta = ImageMeta(n / 15, power, angle, aim.u if aim else -1, aim.v if aim else -1)

@@ -50,7 +50,8 @@ def make(
     to_spots = surface.interpolation(triangle, barycentric)
     empty = np.full((lasers, spots, len(points)), np.nan, np.float32)
     level = np.zeros((spots, len(points)))
-    bare = Samples(mesh, 1.3, where, empty, empty, empty, level.astype(np.float32), level)
+    facing = np.ones_like(level, np.float32)
+    bare = Samples(mesh, 1.3, where, empty, empty, empty, level.astype(np.float32), level, facing)
     values, truths = [], []
     for laser in range(lasers):
 
@@ -76,6 +77,7 @@ def make(
         slope.astype(np.float32),
         level.astype(np.float32),
         level,
+        facing,
     )
     truth = np.stack(truths)
     return Synthetic(samples, 0.5 * (truth + truth.transpose(0, 2, 1)))

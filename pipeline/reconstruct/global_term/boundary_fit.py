@@ -3,7 +3,8 @@
 Samples come from views that are not too oblique. The same images show the surface at grazing angles too, where a rough
 one transmits up to twice what the smooth one of the assumed index does: most of a relit image's error near the outline.
 The images of all spots are summed and compared, by view cosine, with what the model expects. By reciprocity the ratio
-holds for light that enters, too.
+holds for light that enters, too. R_d and the transmittance share one level, which images do not part: R_d has it, and
+the ratio is 1 on average where samples were taken (docs/decisions/0093).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from hw.base.arrays import F64
 from pipeline.geometry.fresnel import Boundary, transmittance
 from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.pixel_footprints import trace_pixels
-from pipeline.reconstruct.samples.samples import SpotSumImage
+from pipeline.reconstruct.samples.samples import Samples, SpotSumImage
 
 EDGES = np.array([0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0 + 1e-9])
 LEAST, MOST = 0.5, 2.0  # of the smooth transmittance; at the outline itself scan and object do not meet
@@ -63,3 +64,23 @@ def measure_boundary(
     ratio = np.clip(seen[known] / model[known], LEAST, MOST)
     middle = 0.5 * (EDGES[known] + EDGES[known + 1])
     return Boundary(eta, tuple(map(float, middle)), tuple(map(float, ratio)))
+
+
+def of_mean_one(boundary: Boundary, samples: Samples, expected: F64) -> Boundary:
+    """The boundary with its ratio divided by the mean that it has where light of the samples enters and leaves.
+
+    A sample is divided by the smooth F_t of both ends, so R_d holds the product of the ratio's means there. A ratio
+    that holds a mean, too, would count it at either end once more. One curve serves both ends: it is divided by the
+    geometric mean of theirs.
+
+    expected: (L, S, V) mm^-2, the model's R_d between spots and vertices
+    """
+    spots, area = samples.spots, RayMesh.of(samples.mesh).vertex_areas
+    light = np.where(np.isfinite(samples.values), expected, 0.0).sum(axis=0) * area  # (S, V)
+    entry = np.interp(-(spots.normal * spots.direction).sum(axis=1), boundary.cosines, boundary.ratio)
+    leaving = np.interp(samples.cosine, boundary.cosines, boundary.ratio)
+    total = light.sum()
+    if not total > 0:
+        return boundary
+    level = np.sqrt((light.sum(axis=1) @ entry) * (light * leaving).sum()) / total
+    return Boundary(boundary.eta, boundary.cosines, tuple(float(r / level) for r in boundary.ratio))

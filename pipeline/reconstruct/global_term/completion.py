@@ -23,7 +23,7 @@ from hw.base.arrays import F32, F64, Bool
 from pipeline.geometry.mesh import RayMesh
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
-from pipeline.reconstruct.global_term.boundary_fit import measure_boundary
+from pipeline.reconstruct.global_term.boundary_fit import measure_boundary, of_mean_one
 from pipeline.reconstruct.global_term.harmonics import Harmonics, harmonics
 from pipeline.reconstruct.global_term.radial_profile import DirectionBias, LaserSamples, fit_profile
 from pipeline.reconstruct.samples.samples import ANGULAR, Samples, SpotSumImage
@@ -215,5 +215,6 @@ def complete(samples: Samples) -> RelightableModel:
         return np.stack([fit.at_spots * np.exp(fit.direction_bias(distance) * direction_bias) for fit in fits])
 
     variance = (reflectance**2 * (relative + BOTH_ENDS)).astype(np.float32)
-    boundary = measure_boundary(samples.mesh, samples.eta, samples.glow, expected)
+    measured_ratio = measure_boundary(samples.mesh, samples.eta, samples.glow, expected)
+    boundary = of_mean_one(measured_ratio, samples, np.stack([fit.at_spots for fit in fits]))
     return RelightableModel(samples.mesh, boundary, (GlobalTerm(reflectance.astype(np.float32), measured, variance),))

@@ -51,6 +51,7 @@ class Samples:
     dark_variance, noise_per_signal: (L, S, V); an entry of expectation m has variance dark + per_signal * m
     oblique: (S, V) relative variance that obliqueness adds at both ends (`oblique_variance`)
     direction_bias: (S, V) sum of `forward_component` at both ends, mean over the cameras
+    cosine: (S, V) between normal and direction to the camera, mean over the cameras; 0 where not observed
     glow: per view, images summed over its spots
     """
 
@@ -62,6 +63,7 @@ class Samples:
     noise_per_signal: F32
     oblique: F32
     direction_bias: F64
+    cosine: F32
     glow: tuple[SpotSumImage, ...] = ()
 
     @cached_property
@@ -197,10 +199,10 @@ class _Gathered:
         Precision is that expected at the entry: noise, scatter between directions, obliqueness of the view.
         """
         shape = self.value.shape[1:]
-        share, oblique, direction_bias = (np.zeros(shape, np.float32) for _ in range(3))
+        share, oblique, direction_bias, cosine = (np.zeros(shape, np.float32) for _ in range(4))
         for view, reading in enumerate(self.readings):
             at = self.block(view)
-            share[at], oblique[at] = reading.share, oblique_variance(reading.cosine)
+            share[at], oblique[at], cosine[at] = reading.share, oblique_variance(reading.cosine), reading.cosine
             at_vertices, at_spots = forward_component(mesh, spots, glow[view].camera.position)
             direction_bias[at] = (at_vertices + at_spots)[at[0]]
         dark, slope = self.dark_variance(), self.noise_per_signal()
@@ -223,6 +225,7 @@ class _Gathered:
             (weight**2 * slope).sum(axis=2).astype(np.float32),
             (incidence[:, None] + (common * oblique).sum(axis=1)).astype(np.float32),
             (common * direction_bias).sum(axis=1).astype(np.float64),
+            (common * cosine).sum(axis=1).astype(np.float32),
             glow,
         )
 

@@ -64,8 +64,8 @@ def test_highlights_are_masked_where_they_are(
     """
     real = reconstruct_capture.images
 
-    def with_glint(calibration: Calibration, plan: Plan, address: ImageAddress) -> F64:
-        out = real(calibration, plan, address)
+    def with_glint(calibration: Calibration, plan: Plan, address: ImageAddress, *boundary: object) -> F64:
+        out = real(calibration, plan, address, *boundary)
         if address.kind == "silhouette":
             return out
         camera = calibration.view_camera(address.view)
