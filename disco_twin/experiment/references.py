@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.keys import content_key
-from disco_twin.light.references import load_reference, render_reference, save_reference
+from disco_twin.light.references import Reference, load_reference, save_reference
 from hw.base.errors import InputError
 from hw.base.files import write_atomically
 from pipeline.geometry.camera import PinholeCamera
@@ -25,7 +24,7 @@ log = logging.getLogger(__name__)
 
 
 def reference_key(scene: Scene, light: Light, view: CameraConfig) -> str:
-    """Key of a reference image: object, wavelengths, light and view. More walks make it better, not another one."""
+    """Key of a reference image: object, wavelengths, light and view. Less noise makes it better, not another one."""
     lasers = [laser.wavelength_nm for laser in scene.rig.lasers]
     return content_key(scene.object.model_dump(), lasers, light.model_dump(), view.model_dump())
 
@@ -41,7 +40,7 @@ def shipped_references(scene_file: Path, name: str) -> Path:
 
 
 def holds_reference(folder: Path, experiment: Experiment, light: Light, view: CameraConfig) -> bool:
-    """Whether a folder holds this scene's reference of a light and view, with walks enough."""
+    """Whether a folder holds this scene's reference of a light and view, with as little noise as it asks for."""
     path = reference_path(folder, light, view)
     if not path.is_file():
         return False
@@ -50,8 +49,8 @@ def holds_reference(folder: Path, experiment: Experiment, light: Light, view: Ca
     except InputError as error:
         log.warning("%s", error)
         return False
-    walks = experiment.scene.simulation.reference_walks
-    return found.key == reference_key(experiment.scene, light, view) and found.walks >= walks // 2
+    wanted = experiment.scene.simulation.reference_noise
+    return found.key == reference_key(experiment.scene, light, view) and found.noise <= wanted
 
 
 def render_references(experiment: Experiment, shipped: Path, own: Path, progress: Progress) -> int:
@@ -78,8 +77,10 @@ def render_references(experiment: Experiment, shipped: Path, own: Path, progress
 
 
 def _render(experiment: Experiment, light: Light, views: Sequence[CameraConfig], own: Path) -> None:
+    from disco_twin.light.rendering import render_reference  # what is stored can be read without a renderer
+
     cameras = [PinholeCamera.from_config(v) for v in views]
-    walks, seed = experiment.scene.simulation.reference_walks, experiment.seed(f"reference {light.name}")
-    for view, image in zip(views, render_reference(experiment.transport, light, cameras, walks, seed), strict=True):
-        image = replace(image, key=reference_key(experiment.scene, light, view))
-        save_reference(reference_path(own, light, view), image)
+    noise, seed = experiment.scene.simulation.reference_noise, experiment.seed(f"reference {light.name}")
+    for view, halves in zip(views, render_reference(experiment.transport, light, cameras, noise, seed), strict=True):
+        key = reference_key(experiment.scene, light, view)
+        save_reference(reference_path(own, light, view), Reference(halves, noise, key))

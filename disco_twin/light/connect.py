@@ -4,6 +4,11 @@ Seen from inside, the directions that refract towards a camera fill a narrow lob
 near the surface therefore sends an extra flight into a von Mises-Fisher lobe about that direction; its contribution
 and that of ordinary exits are combined by the balance heuristic (Veach 1997, section 9.2.2). Across an index-matched
 boundary the connection is straight instead.
+
+For captures an outer step of the walk draws one of its collisions, all alike, which sends one lobe to each camera.
+References are made by *even* connections (docs/decisions/0054): collisions are drawn, and send lobes, in proportion to
+what they promise; lobes are wider towards grazing angles, and a share of them is wide everywhere, lest the tails of
+what the boundary refracts be left to rare and bright exits.
 """
 
 from __future__ import annotations
@@ -15,7 +20,12 @@ import mitsuba as mi
 
 from disco_twin.light import MOST_CAMERAS, sampling
 from disco_twin.light.sampling import Rng
-from disco_twin.light.tables import FAR, ROW, Cameras, Images, Tables, cell_index, medium_at
+from disco_twin.light.tables import FAR, ROW, Cameras, Images, Sky, Tables, boundary_context, cell_index, medium_at
+
+CONNECTIONS = 2.0  # even ones that a collision right below the surface sends, in the mean
+LEAST = 0.05  # of that are sent from as deep as `Tables.reach`
+SHARPER = 1.25  # concentration of a lobe along the normal, beside that of captures
+WIDE, WIDER = 0.2, 10.0  # share of the lobes that are so many times less concentrated
 
 
 def drawn_camera(cams: Cameras, k: Any, rng: Rng) -> tuple[Any, float]:
@@ -36,14 +46,36 @@ def refracted_axis(t: Tables, normal: Any, towards: Any) -> Any:
     return dr.normalize(tangent + normal * dr.safe_sqrt(1.0 - dr.squared_norm(tangent)))
 
 
-def lobe_density(t: Tables, q: Any, direction: Any, target: Any) -> tuple[Any, Any, Any]:
-    """Axis of the lobe at collision q towards `target`, its density at `direction`, and whether it is used there."""
+def lobe_at(t: Tables, q: Any, target: Any) -> tuple[Any, Any, Any]:
+    """Axis and concentration of the lobe at collision q towards `target`, and whether it is used there."""
     index = cell_index(t, q)
     normal = dr.gather(mi.Vector3f, t.normal, index)
     towards = dr.normalize(target - q)
-    usable = (dr.dot(normal, towards) > -0.1) & (dr.squared_norm(normal) > 0.5)
-    axis = refracted_axis(t, normal, towards)
-    return axis, sampling.von_mises_fisher_pdf(dr.dot(axis, direction), t.kappa), usable
+    outside = dr.dot(normal, towards)
+    usable = (outside > -0.1) & (dr.squared_norm(normal) > 0.5)
+    kappa = t.kappa
+    if t.even and t.eta > 1.0:
+        # A facet that is tilted by v turns what it refracts by v (1 - cos_o / (eta cos_i)) in the plane of incidence,
+        # at grazing angles eta / (eta - 1) times as far as at normal ones, and across that plane about as far.
+        outside = dr.maximum(outside, 0.0)
+        inside = dr.sqrt(t.eta * t.eta - 1.0 + outside * outside)  # eta cos_i
+        kappa = kappa * (SHARPER * (1.0 - 1.0 / t.eta)) / (1.0 - outside / inside)
+    return refracted_axis(t, normal, towards), kappa, usable
+
+
+def lobe_pdf(t: Tables, kappa: Any, cosine: Any) -> Any:
+    """Density of the lobe at `cosine` from its axis."""
+    narrow = sampling.von_mises_fisher_pdf(cosine, kappa)
+    if not t.even:
+        return narrow
+    return (1.0 - WIDE) * narrow + WIDE * sampling.von_mises_fisher_pdf(cosine, kappa / WIDER)
+
+
+def promise(t: Tables, empty: Any) -> Any:
+    """What a collision that lies `empty` mm below the surface may bring, beside one right below it: exp(-depth / mean
+    free path). 1 where all collisions count the same.
+    """
+    return dr.maximum(dr.exp(-6.0 / t.reach * empty), LEAST) if t.even else 1.0
 
 
 @dr.syntax
@@ -139,7 +171,7 @@ def connect_lobes(
 ) -> Rng:
     """Connect one drawn collision to the cameras. `before` is the flight's direction before the collision."""
     pixels = cams.width * cams.height
-    context = mi.BSDFContext(mi.TransportMode.Importance)
+    context = boundary_context(t)
     turn = mi.UInt32(0)
     while dr.hint(turn < min(cams.count, MOST_CAMERAS), label="lobes"):
         camera, times = drawn_camera(cams, turn, rng)
@@ -156,11 +188,13 @@ def connect_lobes(
         else:
             row = camera * ROW
             eye = mi.Point3f(*[dr.gather(mi.Float, cams.rows, row + k) for k in range(3)])
-            axis, _, usable = lobe_density(t, point, before, eye)
+            axis, kappa, usable = lobe_at(t, point, eye)
             if dr.hint(usable):
-                kappa = t.kappa
-                omega = sampling.von_mises_fisher(rng, axis, kappa)
-                lobe = sampling.von_mises_fisher_pdf(dr.dot(axis, omega), kappa)
+                width = mi.Float(kappa)
+                if dr.hint(t.even, mode="scalar"):
+                    width = dr.select(rng.next() < WIDE, kappa / WIDER, kappa)
+                omega = sampling.von_mises_fisher(rng, axis, width)
+                lobe = lobe_pdf(t, kappa, dr.dot(axis, omega))
                 phase = sampling.henyey_greenstein_pdf(dr.dot(before, omega), t.g)
                 hit = t.scene.ray_intersect(
                     mi.Ray3f(point, omega, t.length, 0.0, mi.Color0f()), mi.RayFlags.Minimal, False, True
@@ -197,7 +231,7 @@ def connect_exit(
     connection could have made the same path (then the balance heuristic shares it).
     """
     pixels = cams.width * cams.height
-    context = mi.BSDFContext(mi.TransportMode.Importance)
+    context = boundary_context(t)
     turn = mi.UInt32(0)
     while dr.hint(turn < min(cams.count, MOST_CAMERAS), label="exits"):
         camera, times = drawn_camera(cams, turn, rng)
@@ -205,15 +239,37 @@ def connect_exit(
         seen &= dr.dot(si.n, towards) > 0.0
         if dr.hint(seen):
             value = t.bsdf.eval(context, si, si.to_local(towards), True)[0] * (factor * times)
-            _, lobe, usable = lobe_density(t, collision, direction, position)
+            axis, kappa, usable = lobe_at(t, collision, position)
+            lobe = lobe_pdf(t, kappa, dr.dot(axis, direction))
             value *= dr.select(lobed & usable, phase / (phase + lobe), 1.0)
             if dr.hint(value > 0.0):
                 start = mi.Point3f(si.p + si.n * t.lift)
                 blocked = t.scene.ray_test(mi.Ray3f(start, towards, FAR, 0.0, mi.Color0f()), False, True)
-                layer = mi.UInt32(0)
-                if dr.hint(images.layers == 2, mode="scalar"):
-                    layer = dr.select(surface_only, mi.UInt32(1), mi.UInt32(0))
-                base = ((tag * images.layers + layer) * cams.count + camera) * (t.lasers * pixels) + pixel
+                base = (first_image(images, tag, surface_only, cams.count) + camera) * (t.lasers * pixels) + pixel
                 splat(images.exits, images.exits_squared, images, base, pixels, weight * value, t.lasers, rng, ~blocked)
         turn += 1
     return rng
+
+
+def first_image(images: Images, tag: Any, surface_only: Any, count: int) -> Any:
+    """Number of the first of a tag's `count` images of the layer that the light belongs to."""
+    layer = dr.select(surface_only, mi.UInt32(1), mi.UInt32(0)) if images.layers == 2 else mi.UInt32(0)
+    return (tag * images.layers + layer) * count
+
+
+def meet_sky(
+    t: Tables,
+    sky: Sky | None,
+    images: Images | None,
+    tag: Any,
+    towards: Any,
+    weight: Any,
+    surface_only: Any,
+    rng: Rng,
+    ok: Any,
+) -> None:
+    """What the sky radiates from the direction `towards` in which a walk from a pixel has left."""
+    assert sky is not None and images is not None
+    base = first_image(images, tag, surface_only, 1) * t.lasers
+    value = weight * sky.source.radiance(towards)
+    splat(images.exits, images.exits_squared, images, base, 1, value, t.lasers, rng, ok)

@@ -26,6 +26,7 @@ from hw.base.arrays import F64, I64, Bool
 CELLS = 32  # along the object's longest side
 INNER_POINTS = 3  # of each cell and axis, at which the medium is read
 DARKEST = 3e-6  # of the brightest fluence, which R_d follows: 1e-5 of the peak is what is asked for, and then some
+HEAVIEST = 8.0  # target weight: where no view looks photons are few, but not so few that what diffusion missed is lost
 STEEPEST = 32.0  # ratio of neighbouring cells' targets: where diffusion falls too fast, photons must not burst
 
 
@@ -38,6 +39,16 @@ class Splitting:
 
     entries: F64
     effort: float = 3.0
+
+
+@dataclass(frozen=True)
+class Views:
+    """What photons are to reach, for windows that lead there: beams enter at `entries` (N, 3), and `seen` holds, per
+    view, the (M, 3) points of the surface that its pixels show; mm.
+    """
+
+    entries: F64
+    seen: tuple[F64, ...]
 
 
 @dataclass(frozen=True)
@@ -54,13 +65,23 @@ class Diffusion:
     cell: float
     factor: Any
 
-    def fluence(self, points: ArrayLike) -> F64:
-        """(N, n, n, n) fluence of N sources of 1 W at `points` (N, 3), clamped to the object."""
+    def unknowns(self, points: ArrayLike) -> I64:
+        """(N,) numbers of the cells that `points` (N, 3) lie in, clamped to the object."""
         n = len(self.number)
         index = np.clip(np.floor((np.asarray(points, float) - self.low) / self.cell).astype(int), 0, n - 1)
-        right = np.zeros((self.factor.shape[0], len(index)))
-        right[self.number[index[:, 2], index[:, 1], index[:, 0]], np.arange(len(index))] = 1.0
+        return np.asarray(self.number[index[:, 2], index[:, 1], index[:, 0]])
+
+    def fluence(self, points: ArrayLike) -> F64:
+        """(N, n, n, n) fluence of N sources of 1 W at `points` (N, 3)."""
+        cells = self.unknowns(points)
+        right = np.zeros((self.factor.shape[0], len(cells)))
+        right[cells, np.arange(len(cells))] = 1.0
         return np.ascontiguousarray(np.moveaxis(self.factor.solve(right)[self.number], -1, 0))
+
+    def spread(self, points: ArrayLike) -> F64:
+        """(cells,) fluence of 1 W shared among the `points` (N, 3)."""
+        right = np.bincount(self.unknowns(points), minlength=self.factor.shape[0]) / len(np.asarray(points))
+        return np.asarray(self.factor.solve(right))
 
 
 def reduced_coefficients(obj: TwinObject, laser: int, centres: F64, cell: float) -> tuple[F64, F64]:
@@ -125,6 +146,30 @@ def diffusion(obj: TwinObject, laser: int, cells: int = CELLS) -> Diffusion:
     return Diffusion(filled, number[tuple(nearest)], corner, cell, factor)
 
 
+def view_targets(estimate: Diffusion, views: Views) -> F64:
+    """(1, n, n, n) target weights: the importance at the entry over that at a place, for all views together.
+
+    Importance is the adjoint fluence (Wagner and Haghighat 1998, CADIS): the diffusion operator is its own adjoint, so
+    it is the fluence of sources in the cells that a view shows. A view counts by the reciprocal of its brightness, the
+    signal-weighted mean of the fluence in what it shows, so that faint views become as precise as bright ones (Wagner
+    et al. 2014, FW-CADIS, with one response a view).
+    """
+    forward = estimate.spread(views.entries)
+    adjoint = np.zeros_like(forward)
+    for points in views.seen:
+        cells = estimate.unknowns(points)
+        shown = forward[cells]
+        adjoint += estimate.spread(points) * len(points) * shown.sum() / (shown**2).sum()
+    entry = float(adjoint[estimate.unknowns(views.entries)].mean())
+    targets = np.clip(entry / adjoint, DARKEST, HEAVIEST)[estimate.number]
+    return in_steps(np.maximum(targets, ndimage.maximum_filter(targets, 3) / STEEPEST))[None]
+
+
+def in_steps(targets: F64) -> F64:
+    """Rounded to a quarter octave: the solver's last bit must not decide about a photon."""
+    return np.asarray(np.exp2(np.round(4 * np.log2(targets)) / 4))
+
+
 def window_targets(fluence: F64, filled: Bool, effort: float) -> F64:
     """(N, n, n, n) target weights: min(1, fluence / f), with the f at which `effort` times the collisions are made.
 
@@ -145,5 +190,4 @@ def window_targets(fluence: F64, filled: Bool, effort: float) -> F64:
             low, high = (low, level) if collisions(level) > effort * inside.sum() else (level, high)
         target[...] = np.minimum(kept / low, 1.0)
         np.maximum(target, ndimage.maximum_filter(target, 3) / STEEPEST, out=target)
-    # In steps of a quarter octave: the solver's last bit must not decide about a photon.
-    return np.exp2(np.round(4 * np.log2(targets)) / 4)
+    return in_steps(targets)

@@ -1,4 +1,4 @@
-"""Reference images: the object under other light, traced through the same medium, never through eq. 2.1.
+"""Reference images as they are kept: the object under other light, never through eq. 2.1 (rendering.py makes them).
 
 Two independent halves per image let a score remove the reference's noise without bias; light from below the surface
 and light reflected at it are separate layers, since R_d answers for the first alone.
@@ -6,24 +6,17 @@ and light reflected at it are separate layers, since R_d answers for the first a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hw.base.arrays import F32
 from hw.base.errors import InputError
 from hw.base.files import replacing, require_version
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.relight.lights import Light
 
-if TYPE_CHECKING:
-    from disco_twin.light.transport import Transport
-
-
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 RENDER_AGAIN = "delete it, disco-twin run renders it again"
 LAYERS = ("subsurface", "surface")
 HALVES = ("A", "B")
@@ -34,26 +27,21 @@ class Reference:
     """One light seen by one camera.
 
     halves: (2, 2, L, H, W) float32 radiance (half, layer, laser, row, column) in W/(mm^2 sr);
-    walks: photons in each half; key: hash of all that the image depends on.
+    noise: that it was rendered for, see `noise_of`; key: hash of all that the image depends on.
     """
 
     halves: F32
-    walks: int
+    noise: float
     key: str
 
 
-def render_reference(
-    transport: Transport, light: Light, cameras: Sequence[PinholeCamera], walks: int, seed: int, key: str = ""
-) -> list[Reference]:
-    """Trace one light towards all cameras at once; `walks` is the number of photons in both halves together."""
-    from disco_twin.light.sources import light_source  # what is stored can be read without a renderer
-
-    half = max(1, walks // 2)
-    traced = transport.trace(
-        lambda group: light_source(light, transport.radius, group), 2, half, seed=seed, cameras=cameras, layers=2
-    )
-    assert traced.images is not None
-    return [Reference(traced.images[:, :, c], half, key) for c in range(len(cameras))]
+def noise_of(halves: F32) -> float:
+    """Noise over the image: the deviation of the mean of both halves as a share of its root mean square, all lasers
+    together, of light from below the surface. halves: (2, 2, L, H, W); 0 for a black image, infinite in the dark.
+    """
+    a, b = halves[:, LAYERS.index("subsurface")].astype(np.float64)
+    noise, signal = float(((a - b) ** 2).sum()) / 4, float((a * b).sum())
+    return math.sqrt(noise / signal) if signal > 0 else (math.inf if noise else 0.0)
 
 
 def save_reference(path: Path, reference: Reference) -> None:
@@ -74,7 +62,7 @@ def save_reference(path: Path, reference: Reference) -> None:
         "type": OpenEXR.scanlineimage,
         "formatVersion": FORMAT_VERSION,
         "radianceScale": scale,
-        "walks": str(reference.walks),
+        "noise": str(reference.noise),
         "key": reference.key,
     }
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -98,4 +86,4 @@ def load_reference(path: Path) -> Reference:
     names = [[[f"{layer}.{half}.{k}" for k in range(lasers)] for layer in LAYERS] for half in HALVES]
     halves = np.array([[[channels[name] for name in row] for row in rows] for rows in names])
     scale = float(header["radianceScale"])
-    return Reference(halves.astype(np.float32) * scale, int(header["walks"]), str(header["key"]))
+    return Reference(halves.astype(np.float32) * scale, float(header["noise"]), str(header["key"]))

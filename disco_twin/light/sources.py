@@ -156,29 +156,36 @@ class EnvironmentSource:
         total = max(sum(share), 1e-30)  # black light is allowed
         self.share = np.asarray(share) / total
         self.scale = total * math.pi * radius**2
+        self.brightest = max(float(np.max(light.constant)) + sum(float(p.max()) for p in peak), 1e-30)
         self.lobes = [
             (opaque3(mi.Vector3f, a), to_float(p), dr.opaque(mi.Float, k))
             for a, p, k in zip(axes, peak, kappa, strict=True)
         ]
 
     def launch(self, rng: Rng, tag: Any, active: Any) -> tuple[Any, Any, Any]:
-        zero = mi.UInt32(0)
         pick, towards = rng.next(), sampling.uniform_sphere(rng)
         edge = float(self.share[0])
         for (axis, _, kappa), share in zip(self.lobes, self.share[1:], strict=True):
             candidate = sampling.von_mises_fisher(rng, axis, kappa)
             towards = dr.select((pick >= edge) & (pick < edge + share), candidate, towards)
             edge += float(share)
-        radiance = dr.gather(self.weight, self.constant, zero, active)
+        radiance = self.radiance(towards, active)
         density = mi.Float(float(self.share[0]) / (4 * math.pi))
-        for (axis, peak, kappa), share in zip(self.lobes, self.share[1:], strict=True):
-            cosine = dr.dot(axis, towards)
-            radiance = radiance + dr.gather(self.weight, peak, zero, active) * dr.exp(kappa * (cosine - 1.0))
-            density = density + float(share) * sampling.von_mises_fisher_pdf(cosine, kappa)
+        for (axis, _, kappa), share in zip(self.lobes, self.share[1:], strict=True):
+            density = density + float(share) * sampling.von_mises_fisher_pdf(dr.dot(axis, towards), kappa)
         disc = sampling.uniform_disc(rng)
         frame = mi.Frame3f(towards)
         position = (frame.n * 2.0 + frame.s * disc.x + frame.t * disc.y) * self.radius
         return mi.Point3f(position), mi.Vector3f(-towards), radiance * (math.pi * self.radius**2) / density
+
+    def radiance(self, towards: Any, active: Any = True) -> Any:
+        """W/(mm^2 sr) per wavelength that comes from the direction `towards`."""
+        zero = mi.UInt32(0)
+        radiance = dr.gather(self.weight, self.constant, zero, active)
+        for axis, peak, kappa in self.lobes:
+            cosine = dr.dot(axis, towards)
+            radiance = radiance + dr.gather(self.weight, peak, zero, active) * dr.exp(kappa * (cosine - 1.0))
+        return radiance
 
 
 class ProjectorSource:
@@ -212,18 +219,23 @@ class ProjectorSource:
         return mi.Point3f(self.position), mi.Vector3f(direction), weight
 
 
-def light_source(light: Light, radius: float, lasers: Sequence[int]) -> Source:
-    """The source of one of the scene's lights for some lasers; `radius` bounds the object around the origin (mm)."""
+def sky_source(light: Uniform | Environment, radius: float, lasers: Sequence[int]) -> EnvironmentSource:
+    """The source of a light from all around for some lasers."""
+    if isinstance(light, Uniform):
+        light = Environment(constant=tuple(light.radiance * c for c in light.colour))
 
     def pick(colour: Colour) -> Colour:
         return tuple(colour[k] for k in lasers)
 
-    if isinstance(light, Environment):
-        lobes = tuple(lobe.model_copy(update={"radiance": pick(lobe.radiance)}) for lobe in light.lobes)
-        return EnvironmentSource(Environment(constant=pick(light.constant), lobes=lobes), radius)
-    colour = pick(light.colour)
-    if isinstance(light, Uniform):
-        return EnvironmentSource(Environment(constant=tuple(light.radiance * c for c in colour)), radius)
+    lobes = tuple(lobe.model_copy(update={"radiance": pick(lobe.radiance)}) for lobe in light.lobes)
+    return EnvironmentSource(Environment(constant=pick(light.constant), lobes=lobes), radius)
+
+
+def light_source(light: Light, radius: float, lasers: Sequence[int]) -> Source:
+    """The source of one of the scene's lights for some lasers; `radius` bounds the object around the origin (mm)."""
+    if isinstance(light, Uniform | Environment):
+        return sky_source(light, radius, lasers)
+    colour = tuple(light.colour[k] for k in lasers)
     if isinstance(light, Directional):
         return DirectionalSource(light.model_copy(update={"colour": colour}), radius)
     if isinstance(light, TexturedProjector):

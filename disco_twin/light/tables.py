@@ -28,6 +28,8 @@ class Tables(Opaque):
     bsdf: Any
     lasers: int
     matched: bool
+    shine: bool  # the surface reflects light and lets none in
+    even: bool  # connections are even (connect.py)
     eta: float
     homogeneous: bool
     isotropic: bool
@@ -67,6 +69,12 @@ class Cameras(Opaque):
 ROW = 21
 
 
+class Sky(Opaque):
+    """A light from all around, for walks that start at pixels, each pixel a tag: they meet it where they leave."""
+
+    source: Any  # EnvironmentSource
+
+
 class Images(Opaque):
     """Integer accumulators of the images: sums and sums of squares from exits and from lobe connections.
 
@@ -92,6 +100,14 @@ class Deposits(Opaque):
     total: Any
     inverse_quantum: Any
     scale: float
+
+
+def boundary_context(t: Tables) -> Any:
+    """For Mitsuba's BSDF: power is conserved, and where the surface but shines it reflects (component 0) alone."""
+    context = mi.BSDFContext(mi.TransportMode.Importance)
+    if t.shine:
+        context.component = 0
+    return context
 
 
 def cell_index(t: Tables, q: Any) -> Any:

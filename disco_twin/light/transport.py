@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from disco_twin.light import tables as kernel
 from disco_twin.light.balance import EnergyBalance
 from disco_twin.light.distance import DistanceField, build_distance_field
-from disco_twin.light.importance import Diffusion, Splitting, diffusion, window_targets
+from disco_twin.light.importance import Diffusion, Splitting, Views, diffusion, view_targets, window_targets
 from disco_twin.light.majorants import LocalMajorants, local_majorants
-from disco_twin.light.sources import Source, opaque3, to_float, weight_type
+from disco_twin.light.sources import EnvironmentSource, Source, opaque3, to_float, weight_type
 from disco_twin.light.splitting import Window
 from disco_twin.light.tables import FAR
 from disco_twin.light.walk import Tally, walk
@@ -112,6 +112,8 @@ class Transport:
             scene=self.scene,
             bsdf=self.scene.shapes()[0].bsdf(),
             matched=self.object.boundary.kind == "matched",
+            shine=False,
+            even=False,
             eta=self.object.boundary.eta,
             normal=to_float(field.normal),
             cells=field.cells,
@@ -175,16 +177,20 @@ class Transport:
             medium_scale=opaque3(mi.Vector3f, np.array([nx, ny, nz]) / size),
         )
 
-    def _window(self, group: Sequence[int], split: Splitting) -> Window:
+    def _window(self, group: Sequence[int], split: Splitting | Views, tags: int) -> Window:
         """The tags' weight windows; tags whose light enters at one place share a map."""
         absorbed = [float((self.object.medium.sigma_t[k] * (1 - self.object.medium.albedo[k])).mean()) for k in group]
         laser = group[int(np.argmin(absorbed))]  # the others' light is fainter everywhere
         if laser not in self._diffusion:
             self._diffusion[laser] = diffusion(self.object, laser)
         estimate = self._diffusion[laser]
-        places, maps = np.unique(split.entries, axis=0, return_inverse=True)
+        if isinstance(split, Views):
+            targets, maps = view_targets(estimate, split), np.zeros(tags, np.int64)
+        else:
+            places, maps = np.unique(split.entries, axis=0, return_inverse=True)
+            targets = window_targets(estimate.fluence(places), estimate.filled, split.effort)
         return Window(
-            target=to_float(window_targets(estimate.fluence(places), estimate.filled, split.effort)),
+            target=to_float(targets),
             maps=mi.UInt32(maps.ravel().astype(np.uint32)),
             cells=len(estimate.number),
             low=opaque3(mi.Point3f, estimate.low),
@@ -200,25 +206,31 @@ class Transport:
         seed: int,
         streams: NDArray[np.uint32] | None = None,
         cameras: Sequence[PinholeCamera] = (),
+        sky: Callable[[Sequence[int]], EnvironmentSource] | None = None,
         layers: int = 1,
         deposit: bool = False,
         first: int = 0,
         lanes: int = LANES,
-        split: Splitting | None = None,
+        split: Splitting | Views | None = None,
+        even: bool = False,
+        shine: bool = False,
     ) -> Traced:
         """Walk `walks` photons (numbers `first`...) of each of `tags` tags.
 
-        make_source: (group of laser indices) -> Source. streams: (T,) names of the tags' random streams, so that a
+        make_source: (group of laser indices) -> Source. sky: (group) -> light for walks that start at pixels, in place
+        of cameras; images are (T, layers, 1, L, 1, 1) then. streams: (T,) names of the tags' random streams, so that a
         spot gives the same image whatever it is traced together with; 0, 1, 2, ... by default. split: weight windows,
-        which make faint light as precise as bright (importance.py).
+        which make faint light as precise as bright, or lead to what the cameras see (importance.py). even: connections
+        are (connect.py). shine: the surface reflects light and lets none in.
         """
         streams = np.arange(tags, dtype=np.uint32) if streams is None else streams.astype(np.uint32)
         parts = [
             self._trace_group(
-                make_source(group), group, tags, walks, seed, streams, cameras, layers, deposit, first, lanes, split
+                make_source(group), group, tags, walks, seed, streams, cameras, sky(group) if sky else None, layers,
+                deposit, first, lanes, split, even, shine,
             )
             for group in self.groups
-        ]
+        ]  # fmt: skip
         order = np.argsort([laser for group in self.groups for laser in group])
 
         def join(name: str, axis: int) -> Any:
@@ -234,28 +246,31 @@ class Transport:
 
     def _trace_group(
         self, source: Source, group: tuple[int, ...], tags: int, walks: int, seed: int, streams: NDArray[np.uint32],
-        cameras: Sequence[PinholeCamera], layers: int, deposit: bool, first: int, lanes: int,
-        split: Splitting | None,
+        cameras: Sequence[PinholeCamera], sky: EnvironmentSource | None, layers: int, deposit: bool, first: int,
+        lanes: int, split: Splitting | Views | None, even: bool, shine: bool,
     ) -> Traced:  # fmt: skip
-        tables = self._tables(group)
+        tables = kernel.Tables(**vars(self._tables(group)) | {"even": even, "shine": shine})
         table = camera_table(cameras) if cameras else None
-        numbers = 4 * layers * table.count * table.width * table.height if table else 0
+        met = kernel.Sky(source=sky) if sky is not None else None
+        layout = (table.count, len(group), table.height, table.width) if table else (1, len(group), 1, 1) if met else ()
+        numbers = 4 * layers * (int(np.prod(layout)) // len(group)) if layout else 0
         per_tag = 8 * len(group) * (numbers + deposit * len(self.vertices))
         batch = max(1, min(tags, ACCUMULATOR_BYTES // max(per_tag, 1), (1 << 31) // max(walks, 1)))
         names = mi.UInt32(streams)
-        window = self._window(group, split) if split is not None else None
+        window = self._window(group, split, tags) if split is not None else None
         total = {name: np.zeros(len(group)) for name in Tally.__dataclass_fields__}
         images, variances, deposits = [], [], []
         for low in range(0, tags, batch):
             n = min(batch, tags - low)
-            shape = (n, layers, table.count, len(group), table.height, table.width) if table else ()
-            pictures = new_images(cameras, layers, int(np.prod(shape)), source.scale) if table else None
+            shape = (n, layers, *layout)
+            unit = sky.brightest if sky is not None else nearest_factor(cameras)
+            pictures = new_images(layers, int(np.prod(shape)), source.scale * unit) if layout else None
             powers = new_deposits(n * len(group) * len(self.vertices), walks) if deposit else None
             step = max(1, min(walks, PHOTONS_PER_CALL // n))
             for start in range(0, walks, step):
                 m = min(step, walks - start)
                 balance = walk(
-                    tables, source, table, pictures, powers, dr.opaque(mi.UInt32, n * m), dr.opaque(mi.UInt32, m),
+                    tables, source, table, met, pictures, powers, dr.opaque(mi.UInt32, n * m), dr.opaque(mi.UInt32, m),
                     dr.opaque(mi.UInt32, first + start), dr.opaque(mi.UInt32, low), names,
                     dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), dr.opaque(mi.Float, 1.0 / source.scale), window, lanes,
                 )  # fmt: skip
@@ -313,9 +328,13 @@ def camera_table(cameras: Sequence[PinholeCamera]) -> kernel.Cameras:
     return kernel.Cameras(count=len(cameras), width=width, height=height, rows=to_float(np.stack(rows)))
 
 
-def new_images(cameras: Sequence[PinholeCamera], layers: int, size: int, weight: float) -> kernel.Images:
-    """Zeroed accumulators. The quantum is 2^-24 of what a photon of that weight adds at the nearest camera."""
-    unit = weight * max(float(c.focal.prod() / (c.position @ c.position)) for c in cameras)
+def nearest_factor(cameras: Sequence[PinholeCamera]) -> float:
+    """1 / (distance^2 * pixel solid angle) of the nearest camera; without one, 1."""
+    return max((float(c.focal.prod() / (c.position @ c.position)) for c in cameras), default=1.0)
+
+
+def new_images(layers: int, size: int, unit: float) -> kernel.Images:
+    """Zeroed accumulators. The quantum is 2^-24 of `unit`, what a photon of usual power adds."""
     quantum = 2.0 ** (np.floor(np.log2(unit)) - 24)
     quantum_squared = 2.0 ** (2 * np.floor(np.log2(unit)) - 24)
     arrays = [dr.zeros(mi.UInt64, size) for _ in range(4)]

@@ -11,7 +11,10 @@ written for Dr.Jit's symbolic loops:
 - *one walk, all wavelengths*: wavelengths that share sigma_t and g differ in albedo alone, so one photon carries a
   weight for each;
 - *lobe connection*: of the collisions of an outer step that lie near the surface one is drawn (reservoir) and connects
-  to the cameras; exits do so too (connect.py).
+  to the cameras; exits do so too (connect.py);
+- *both ways*: a walk may start at a camera's pixel and meet a sky where it leaves. Paths are reciprocal: the share of
+  the sky's radiance that it carries out is what comes back to the pixel, for power and importance cross the boundary by
+  the same factors, whose eta^2 cancel from air to air (Veach 1997, section 5.2).
 
 Images and deposits are accumulated as 64-bit integers of stochastically rounded weights: exact, independent of the
 order of atomics, and so of batch size and thread count.
@@ -28,7 +31,7 @@ import drjit as dr
 import mitsuba as mi
 
 from disco_twin.light import sampling
-from disco_twin.light.connect import connect_exit, connect_lobes
+from disco_twin.light.connect import CONNECTIONS, connect_exit, connect_lobes, meet_sky, promise
 from disco_twin.light.sampling import Rng
 from disco_twin.light.sources import Source, weight_type
 from disco_twin.light.splitting import Window, new_stack, resume, weigh
@@ -37,7 +40,9 @@ from disco_twin.light.tables import (
     Cameras,
     Deposits,
     Images,
+    Sky,
     Tables,
+    boundary_context,
     free_flight,
     medium_at,
     near_surface,
@@ -94,12 +99,14 @@ class Photon:
     # The last collision, for the balance heuristic: place, whether near the surface, phase density of the flight.
     last: Any
     in_reach: Any
-    phase: Any
+    phase: Any  # 0 before the first collision
 
 
 @dataclass
 class Reservoir:
-    """One collision drawn from those of an outer step: how many there were, place, flight before it, power after it."""
+    """One collision drawn from those of an outer step: what all promise (their number, unless connections are even),
+    place, flight before it, power after it over its own promise.
+    """
 
     seen: Any
     point: Any
@@ -134,11 +141,12 @@ def collide(t: Tables, photon: Photon, rate: Any, reservoir: Reservoir, sums: Ta
         photon.w *= albedo
         near = near_surface(t, photon.empty)
         if dr.hint(connects, mode="scalar"):
-            reservoir.seen = dr.select(near, reservoir.seen + 1.0, reservoir.seen)
-            take = near & (rng.next() * reservoir.seen < 1.0)
+            share = promise(t, photon.empty)
+            reservoir.seen = dr.select(near, reservoir.seen + share, reservoir.seen)
+            take = near & (rng.next() * reservoir.seen < share)
             reservoir.point = dr.select(take, photon.p, reservoir.point)
             reservoir.before = dr.select(take, photon.d, reservoir.before)
-            reservoir.weight = dr.select(take, photon.w, reservoir.weight)
+            reservoir.weight = dr.select(take, photon.w / share, reservoir.weight)
         scattered = sampling.uniform_sphere(rng)
         photon.phase = mi.Float(sampling.UNIFORM)
         if dr.hint(not t.isotropic, mode="scalar"):
@@ -173,8 +181,7 @@ def cross(
                 t, cams, images, photon.tag, si, photon.d, photon.w, photon.last, photon.phase, lobed, ~photon.entered,
                 rng,
             )  # fmt: skip
-        context = mi.BSDFContext(mi.TransportMode.Importance)
-        sample, value = t.bsdf.sample(context, si, rng.next(), rng.next2(), True)
+        sample, value = t.bsdf.sample(boundary_context(t), si, rng.next(), rng.next2(), True)
         after = photon.w * value[0]
         sums.boundary += type(sums.boundary)(photon.w - after)
         photon.w = after
@@ -196,7 +203,7 @@ def cross(
 @dr.syntax
 def fly(
     t: Tables, photon: Photon, flight: Any, rate: Any, reservoir: Reservoir, cams: Cameras | None,
-    images: Images | None, deposits: Deposits | None, sums: Tally, rng: Rng,
+    sky: Sky | None, images: Images | None, deposits: Deposits | None, sums: Tally, rng: Rng,
 ) -> Any:  # fmt: skip
     """A flight that may meet the surface: up to it, to the collision at its end, or out of sight.
 
@@ -221,6 +228,10 @@ def fly(
             if dr.hint(~leaked):
                 photon, reservoir, sums, rng = collide(t, photon, rate, reservoir, sums, rng, cams is not None)
         else:
+            if dr.hint(sky is not None, mode="scalar"):
+                # Not of a walk that has met nothing: what lies behind the object is no part of its image.
+                met = photon.phase > 0.0 if t.matched else photon.steps > 1
+                meet_sky(t, sky, images, photon.tag, photon.d, photon.w, ~photon.entered, rng, met)
             sums.reflected += wide(dr.select(photon.entered, 0.0, photon.w))
             sums.escaped += wide(dr.select(photon.entered, photon.w, 0.0))
             photon.alive = mi.Bool(False)
@@ -232,7 +243,7 @@ def fly(
 
 @dr.syntax
 def walk(
-    t: Tables, source: Source, cams: Cameras | None, images: Images | None, deposits: Deposits | None,
+    t: Tables, source: Source, cams: Cameras | None, sky: Sky | None, images: Images | None, deposits: Deposits | None,
     count: Any, per_tag: Any, first: Any, first_tag: Any, streams: Any, seed: Any, inverse_scale: Any,
     window: Window | None, lanes: int,
 ) -> Tally:  # fmt: skip
@@ -268,6 +279,7 @@ def walk(
             photon.alive = running & (dr.max(photon.w) > 0.0)
             photon.tag, photon.steps, photon.clear = tag, mi.UInt32(0), mi.Vector3f(0.0)
             photon.inside, photon.entered, photon.in_reach = mi.Bool(False), mi.Bool(False), mi.Bool(False)
+            photon.phase = mi.Float(0.0)
 
         # 2. Collisions that need no intersection test.
         k = mi.UInt32(0)
@@ -286,11 +298,20 @@ def walk(
 
         # 3. The surface, or a collision that the distance field could not vouch for.
         if dr.hint(photon.alive & pending):
-            photon, reservoir, sums, rng = fly(t, photon, flight, rate, reservoir, cams, images, deposits, sums, rng)
+            photon, reservoir, sums, rng = fly(
+                t, photon, flight, rate, reservoir, cams, sky, images, deposits, sums, rng
+            )
 
         # 4. One drawn collision connects to the cameras, also of a photon that has just left.
         if dr.hint(cams is not None, mode="scalar"):
-            if dr.hint(reservoir.seen > 0.0):
+            if dr.hint(t.even, mode="scalar"):
+                times = dr.floor(reservoir.seen * CONNECTIONS + rng.next())
+                drawn = reservoir.weight * (1.0 / CONNECTIONS)
+                while dr.hint(times > 0.0, label="connections"):
+                    rng = connect_lobes(t, cams, images, photon.tag, reservoir.point, reservoir.before, drawn, rng)
+                    times -= 1.0
+                reservoir.seen = mi.Float(0.0)
+            elif dr.hint(reservoir.seen > 0.0):
                 drawn = reservoir.weight * reservoir.seen
                 rng = connect_lobes(t, cams, images, photon.tag, reservoir.point, reservoir.before, drawn, rng)
                 reservoir.seen = mi.Float(0.0)

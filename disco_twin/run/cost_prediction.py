@@ -16,7 +16,8 @@ from pipeline.plan.targets import make_targets
 
 # Walks per core and second of quick.toml's stages as a run times them, compilation and the images' exposure included
 # (docs/decisions/0052). Other media scale with the number of collisions: there a guess within a factor of two or three.
-SPOT_WALKS, TRUTH_WALKS, REFERENCE_WALKS = 85_000.0, 110_000.0, 140_000.0
+SPOT_WALKS, TRUTH_WALKS = 85_000.0, 110_000.0
+REFERENCE_SECONDS = 80.0  # core-seconds of a light, in both of quick's views at 3 % noise (docs/decisions/0054)
 COMPRESSION = 7.0  # docs/decisions/0002
 IMAGES_PER_S = 15.0  # of the real rig (thesis 4.1)
 BYTES_PER_PIXEL = 3
@@ -28,11 +29,12 @@ def simulation_seconds(experiment: Experiment, lights: int, cores: int) -> dict[
     Wavelengths that share sigma_t and g share their walks.
     """
     work, medium = experiment.scene.simulation, experiment.object.medium
+    images = sum(view.width * view.height for view in experiment.scene.relight.views) / (2 * 192 * 124)  # of quick's
     groups = len({(m.tobytes(), g) for m, g in zip(medium.sigma_t, medium.g, strict=True)})
     return {
         "capture": len(experiment.plan.spots) * work.walks_per_spot * groups / SPOT_WALKS / cores,
         "truth": work.truth_columns * work.truth_walks * groups / TRUTH_WALKS / cores,
-        "references": lights * work.reference_walks * groups / REFERENCE_WALKS / cores,
+        "references": lights * REFERENCE_SECONDS * groups * images * (0.03 / work.reference_noise) ** 2 / cores,
     }
 
 

@@ -184,7 +184,7 @@ def truth_stages(run: Run) -> None:
     keys = [reference_key(scene, light, view) for light in scene.relight.lights for view in scene.relight.views]
     shipped = shipped_references(run.scene_file, scene.name)
     render = partial(render_references, experiment, shipped, folder.twin / "references")
-    run.stage("references", run.key("references", keys, scene.simulation.reference_walks), render, "lights")
+    run.stage("references", run.key("references", keys, scene.simulation.reference_noise), render, "lights")
 
 
 def pipeline_key(run: Run, methods: Sequence[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,12 +20,14 @@ Profile = Literal["full", "small"]
 
 
 class SimulationConfig(Strict):
-    """How much light is traced; the noise goes with the inverse square root of the walks."""
+    """How much light is traced; the noise goes with the inverse square root of the walks, their time with its inverse
+    square.
+    """
 
     walks_per_spot: Count = 200_000
     truth_columns: Count = 24  # scan vertices whose column of R_d is computed as ground truth
     truth_walks: Count = 500_000  # a column, with weight windows
-    reference_walks: Count = 20_000_000  # a light, both halves together
+    reference_noise: Annotated[float, Field(ge=0.002, le=1)] = 0.03  # rms over a reference image, of its rms light
 
 
 class Neck(Strict):
@@ -122,7 +125,7 @@ def shrink(scene: Scene) -> Scene:
         walks_per_spot=max(1000, walks.walks_per_spot // 10),
         truth_columns=min(walks.truth_columns, max(4, walks.truth_columns // 4)),
         truth_walks=max(1000, walks.truth_walks // 10),
-        reference_walks=max(1000, walks.reference_walks // 10),
+        reference_noise=min(1.0, walks.reference_noise * math.sqrt(10)),
     )
     cameras = tuple(half(camera) for camera in scene.rig.cameras)
     spots = min(scene.rig.spots, max(20, scene.rig.spots // 4))
