@@ -36,10 +36,11 @@ def content_key(*parts: Any) -> str:
 
 
 def identity(scene: Scene) -> str:
-    """Key of all that a capture and its ground truth depend on; how they are used may change within a run folder."""
-    return content_key(
-        scene.model_dump(include={"format_version", "name", "seed", "object", "scan", "rig", "simulation"})
-    )
+    """Key of all that a capture and its ground truth depend on; how they are used, and how noisy references may be,
+    may change within a run folder.
+    """
+    parts = {"format_version", "name", "seed", "object", "scan", "rig", "simulation"}
+    return content_key(scene.model_dump(include=parts, exclude={"simulation": {"reference_noise"}}))
 
 
 @cache

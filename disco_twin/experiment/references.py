@@ -77,10 +77,11 @@ def render_references(experiment: Experiment, shipped: Path, own: Path, progress
 
 
 def _render(experiment: Experiment, light: Light, views: Sequence[CameraConfig], own: Path) -> None:
-    from disco_twin.light.rendering import render_reference  # what is stored can be read without a renderer
+    transport = experiment.transport  # starts the renderer
+    from disco_twin.light.rendering import render_reference  # what is stored can be read without one
 
     cameras = [PinholeCamera.from_config(v) for v in views]
     noise, seed = experiment.scene.simulation.reference_noise, experiment.seed(f"reference {light.name}")
-    for view, halves in zip(views, render_reference(experiment.transport, light, cameras, noise, seed), strict=True):
+    for view, halves in zip(views, render_reference(transport, light, cameras, noise, seed), strict=True):
         key = reference_key(experiment.scene, light, view)
         save_reference(reference_path(own, light, view), Reference(halves, noise, key))

@@ -78,7 +78,7 @@ def write_frozen_run(root: Path) -> np.ndarray:
             image = model.image(model.lit_by(light), model.seen_by(PinholeCamera.from_config(view)))
             halves = image * (1 + NOISE * noise.standard_normal((2, 1, *image.shape)))
             layers = np.concatenate([halves, 0 * halves], axis=1).astype(np.float32)
-            save_reference(reference_path(folder.twin / "references", light, view), Reference(layers, 1000, "known"))
+            save_reference(reference_path(folder.twin / "references", light, view), Reference(layers, 0.03, "known"))
     write_json(folder.work / "request.json", pipeline_inputs(scene, ("lambertian",)))
     run(folder.capture, folder.work, read_json(folder.work / "request.json", Request, ""))
     for name in ("capture", "truth", "references", "pipeline"):

@@ -26,7 +26,7 @@ vertices = 100
 walks_per_spot = 200
 truth_columns = 2
 truth_walks = 800
-reference_walks = 200
+reference_noise = 0.5
 [rig]
 spots = 8
 lasers = [{ wavelength_nm = 635.0 }]
@@ -106,7 +106,7 @@ def test_a_changed_function_is_in_the_keys_of_the_stages_that_depend_on_it(proje
     for module, function, again in (
         ("camera/lars3", "lars3_sensor", {"scan", "targets", "capture", "budget"}),
         ("light/sources", "light_source", set(before) - {"targets", "pipeline"}),
-        ("light/references", "render_reference", {"references", "scores", "budget"}),
+        ("light/rendering", "render_reference", {"references", "scores", "budget"}),
     ):
         with (project / "disco_twin" / f"{module}.py").open("a") as file:
             file.write(

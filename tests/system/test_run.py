@@ -21,7 +21,7 @@ SHRINK = """
 walks_per_spot = 60_000
 truth_columns = 16
 truth_walks = 1_000_000
-reference_walks = 3_000_000
+reference_noise = 0.04
 
 [relight]
 lights = ["uniform", "directional"]

@@ -13,13 +13,14 @@ import pytest
 from significance import assert_z
 
 from disco_twin.experiment.references import reference_key, reference_path
-from disco_twin.light.references import load_reference, render_reference
+from disco_twin.light.references import load_reference, noise_of
+from disco_twin.light.rendering import MARGIN, from_light
 from disco_twin.light.transport import Transport
 from disco_twin.object.build import build_object
 from disco_twin.scene.scene import load_scene
 from pipeline.geometry.camera import PinholeCamera
 
-REPLICATES, WALKS, BLOCK = 16, 100_000, 31  # large blocks: the noise of small ones is far from normal
+REPLICATES, WALKS, BLOCK = 16, 60_000, 31  # large blocks: the noise of small ones is far from normal
 LIGHT = "edge"
 
 
@@ -32,7 +33,7 @@ def block_means(image: np.ndarray) -> np.ndarray:
 
 
 def z_scores(ours: np.ndarray, theirs: np.ndarray, share: float) -> np.ndarray:
-    """(N, ...) replicates against one image; share: variance of the difference of means over a replicate's."""
+    """(N, ...) replicates against one image; share: variance of the difference over a replicate's."""
     return np.asarray((ours.mean(axis=0) - theirs) / (ours.std(axis=0, ddof=1) * np.sqrt(share)))
 
 
@@ -44,7 +45,8 @@ def test_shipped_references_belong_to_the_scene(repository: Path) -> None:
         for view in scene.relight.views:
             reference = load_reference(reference_path(folder, light, view))
             assert reference.key == reference_key(scene, light, view)
-            assert 2 * reference.walks >= scene.simulation.reference_walks
+            assert reference.noise <= scene.simulation.reference_noise
+            assert noise_of(reference.halves) < MARGIN * reference.noise
             assert reference.halves.shape == (2, 2, len(scene.rig.lasers), view.height, view.width)
 
 
@@ -52,7 +54,7 @@ def test_a_shipped_reference_is_rendered_again(repository: Path) -> None:
     """Expected: new photons, few of them, agree with the shipped image block by block, layer by layer; with one that is
     three per cent brighter they do not.
 
-    The shipped image comes from the same estimator, so its variance is a replicate's, scaled by the photons.
+    The shipped image comes from the same estimator, so its variance is a replicate's, scaled by the noise over it.
     """
     scene = load_scene(repository / "scenes" / "quick.toml")
     light = next(light for light in scene.relight.lights if light.name == LIGHT)
@@ -60,13 +62,15 @@ def test_a_shipped_reference_is_rendered_again(repository: Path) -> None:
     shipped = [load_reference(reference_path(folder, light, view)) for view in scene.relight.views]
     cameras = [PinholeCamera.from_config(view) for view in scene.relight.views]
     transport = Transport(build_object(scene))
-    halves = [render_reference(transport, light, cameras, 2 * WALKS, 900 + k) for k in range(REPLICATES // 2)]
+    render = from_light(transport, light, cameras, 900)
+    halves = [render(WALKS, 1 + k) for k in range(REPLICATES // 2)]
     for view, reference in enumerate(shipped):
-        again = block_means(np.concatenate([h[view].halves for h in halves]).astype(float))  # (N, layer, laser, block)
+        again = block_means(np.concatenate([h[view] for h in halves]).astype(float))  # (N, layer, laser, block)
         there = block_means(reference.halves.astype(float).mean(axis=0))
         lit = (again > 0).all(axis=0)
         assert lit[0].sum() >= 24
-        share = 1 / REPLICATES + WALKS / (2 * reference.walks)
+        one = 2 * np.mean([noise_of(h[view]) ** 2 for h in halves])  # squared, of a replicate
+        share = 1 / REPLICATES + noise_of(reference.halves) ** 2 / one
         # Student's t with 15 degrees of freedom has heavier tails than the normal distribution: this level keeps 1e-3.
         assert_z(z_scores(again[:, lit], there[lit], share), f"view {view}, blocks", level=1e-5)
         assert_z(z_scores(again.sum(axis=-1), there.sum(axis=-1), share), f"view {view}, sums", level=1e-4)

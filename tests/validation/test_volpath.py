@@ -17,7 +17,7 @@ import trimesh
 from significance import assert_z, z_of_difference
 
 from benchmarks.volpath import volpath_scene
-from disco_twin.light.references import render_reference
+from disco_twin.light.rendering import from_light, from_pixels
 from disco_twin.light.transport import Transport
 from disco_twin.object.build import Medium, TwinBoundary, TwinObject, build_object
 from disco_twin.scene.scene import load_scene
@@ -82,9 +82,11 @@ def test_agrees_with_stock_volpath(boundary: TwinBoundary, heterogeneous: bool, 
     passes = 16
     spp = 128 if kind == "uniform" else 192
     theirs = blocks(volpath_images(obj, camera, light, tmp_path, passes, spp))
-    layers = [
-        render_reference(transport, light, [camera], 2 * 150_000, s)[0].halves[:, :, 0] for s in range(passes // 2)
-    ]
+    if isinstance(light, Uniform):
+        render, walks = from_pixels(transport, light, camera, 0.1, 7), 250
+    else:
+        render, walks = from_light(transport, light, [camera], 7), 100_000
+    layers = [render(walks, run)[0][:, :, 0] for run in range(passes // 2)]
     below, reflected = np.moveaxis(blocks(np.concatenate(layers).astype(np.float64)), 1, 0)
     ours = below + reflected
     seen = (ours > 0).all(axis=0) & (theirs > 0).all(axis=0)  # not the background
@@ -120,9 +122,8 @@ def test_the_quick_scene_agrees_with_stock_volpath(repository: Path, tmp_path: P
     light = Directional(direction=next(x for x in scene.relight.lights if x.name == "directional").direction)
     theirs = blocks(volpath_images(obj, view, light, tmp_path, 16, 16))
     transport = Transport(obj)
-    traced = [
-        render_reference(transport, light, [view], 100_000, seed)[0].halves.sum(axis=1)[:, 0] for seed in range(8)
-    ]
+    render = from_light(transport, light, [view], 7)
+    traced = [render(50_000, run)[0].sum(axis=1)[:, 0] for run in range(8)]
     ours = blocks(np.concatenate(traced).astype(np.float64))
     lit = (ours > 0).all(axis=0) & (theirs > 0).all(axis=0)
     assert lit.sum() >= 12

@@ -262,7 +262,7 @@ def test_references_that_are_gone_or_damaged(tmp_path: Path) -> None:
 
 def test_a_reference_is_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, halves = tmp_path / "uniform@left.exr", np.ones((2, 2, 1, 4, 5), np.float32)
-    save_reference(path, Reference(halves, 10, "old"))
+    save_reference(path, Reference(halves, 0.1, "old"))
 
     def half(_: OpenEXR.File, name: str) -> None:
         Path(name).write_bytes(b"half")
@@ -270,7 +270,7 @@ def test_a_reference_is_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.
 
     monkeypatch.setattr(OpenEXR.File, "write", half)
     with pytest.raises(OSError, match="No space left"):
-        save_reference(path, Reference(halves, 10, "new"))
+        save_reference(path, Reference(halves, 0.1, "new"))
     assert load_reference(path).key == "old" and list(tmp_path.iterdir()) == [path]
     np.testing.assert_allclose(load_reference(path).halves, halves, rtol=1e-3)  # half floats
 

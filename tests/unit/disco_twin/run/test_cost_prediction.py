@@ -36,7 +36,6 @@ def changed(experiment: Experiment, **simulation: Any) -> Experiment:
         ("walks_per_spot", "capture"),
         ("truth_columns", "truth"),
         ("truth_walks", "truth"),
-        ("reference_walks", "references"),
     ],
 )
 def test_a_stage_takes_as_long_as_its_walks(experiment: Experiment, key: str, stage: str) -> None:
@@ -47,6 +46,19 @@ def test_a_stage_takes_as_long_as_its_walks(experiment: Experiment, key: str, st
         assert more[name] == pytest.approx((3 if name == stage else 1) * value)
     assert simulation_seconds(experiment, 7, 1) == pytest.approx({name: 2 * value for name, value in once.items()})
     assert simulation_seconds(experiment, 14, 2)["references"] == pytest.approx(2 * once["references"])
+
+
+def test_references_take_as_long_as_their_noise_and_images(experiment: Experiment) -> None:
+    """Expected behaviour: a third of the noise, nine times the stage, and no other; one view of the two, half of it."""
+    once = simulation_seconds(experiment, 7, 2)
+    finer = changed(experiment, reference_noise=experiment.scene.simulation.reference_noise / 3)
+    assert simulation_seconds(finer, 7, 2) == pytest.approx(once | {"references": 9 * once["references"]})
+    relight = experiment.scene.relight
+    single = changed(experiment)
+    single.scene = experiment.scene.model_copy(
+        update={"relight": relight.model_copy(update={"views": relight.views[:1]})}
+    )
+    assert simulation_seconds(single, 7, 2) == pytest.approx(once | {"references": once["references"] / 2})
 
 
 def test_wavelengths_that_scatter_alike_share_their_walks(experiment: Experiment) -> None:
@@ -64,11 +76,11 @@ def test_wavelengths_that_scatter_alike_share_their_walks(experiment: Experiment
 
 
 def test_references_beside_the_scene_cost_nothing(experiment: Experiment, tmp_path: Path) -> None:
-    """Expected behaviour: a run takes them from there, so the plan counts those that are missing or of other walks."""
+    """Expected behaviour: a run takes them from there, so the plan counts those that are missing or too noisy."""
     there = dict(predict(experiment, shipped_references(SCENE, "quick")))
     assert "none to render" in there["references"]
     assert "minutes" in dict(predict(experiment, tmp_path))["references"]
-    more = changed(experiment, reference_walks=100 * experiment.scene.simulation.reference_walks)
+    more = changed(experiment, reference_noise=experiment.scene.simulation.reference_noise / 10)
     assert "minutes" in dict(predict(more, shipped_references(SCENE, "quick")))["references"]
 
 
