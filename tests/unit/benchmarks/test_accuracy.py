@@ -104,7 +104,7 @@ def test_one_shrunken_object(
     folder = tmp_path / "accuracy" / "score"
     folder.mkdir(parents=True)
     text = (repository / "scenes" / "accuracy" / "score" / f"{accuracy.QUICK_OBJECT}.toml").read_text()
-    text = re.sub(r"reference_walks = \d+", "reference_walks = 2000000", text)
+    text = re.sub(r"reference_noise = [0-9.]+", "reference_noise = 0.06", text)
     text = text.replace("[[relight.views]]", '[relight]\nlights = ["uniform", "directional"]\n\n[[relight.views]]', 1)
     (folder / f"{accuracy.QUICK_OBJECT}.toml").write_text(text)
     monkeypatch.setattr(accuracy, "SCENES", tmp_path)
