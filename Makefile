@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 OUT ?= out/quick
 
-.PHONY: demo test lint validate install references picture curves clean
+.PHONY: demo test lint validate install references accuracy picture curves clean
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -14,7 +14,8 @@ help:
 	@echo "make test      the tests, on every core (minutes)"
 	@echo "make lint      style, types, import rules"
 	@echo "make validate  the slow tests as well: the figures that quick must reach, among them"
-	@echo "make references  render the quick scene's reference images anew"
+	@echo "make references  render the reference images of quick and of the accuracy set that are missing (hours)"
+	@echo "make accuracy  the default beside all baselines on objects that nothing was chosen on (most of an hour)"
 	@echo "make curves    error against seconds of the light's estimators: docs/benchmarks/walk.svg (minutes)"
 	@echo "make picture   the README's picture, from the demo's run"
 
@@ -53,9 +54,16 @@ lint: $(READY)
 validate: $(CLIENTS)
 	$(BIN)/python -m pytest -m "slow or not slow" --timeout 1800
 
-# After a change of the quick scene's object, lights or held-out views, and then commit them.
+# After a change of a scene's object, lights or held-out views, and then commit them. What is there already stays.
+REFERENCED := scenes/quick.toml $(sort $(wildcard scenes/accuracy/*/*.toml))
 references: $(READY)
-	$(BIN)/disco-twin reference scenes/quick.toml --out scenes/references/quick
+	@for scene in $(REFERENCED); do \
+	  $(BIN)/disco-twin reference $$scene --out "$$(dirname $$scene)/references/$$(basename $$scene .toml)" || exit 1; \
+	done
+
+accuracy: $(READY)
+	$(BIN)/python -m benchmarks accuracy --json docs/benchmarks/accuracy.json
+	$(BIN)/python -m benchmarks.accuracy_table docs/benchmarks/accuracy.json docs/accuracy.md
 
 picture: $(READY)
 	$(BIN)/python -m benchmarks.readme_picture $(OUT) docs/picture.png

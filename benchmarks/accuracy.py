@@ -11,6 +11,7 @@ paired      rows of the default against each baseline: the difference of nrmse2,
             their noise
 lost        the rows in which a baseline is better by more than three standard errors
 seconds     of reconstruction and relighting by object and method; memory: peak MiB of the reconstruction
+wall_s      of the whole command: little where captures are there; `stages` says what each stage took when it was done
 failed      objects that could not be run, and why; the others are not lost
 
 Each object is a whole run in out/accuracy/<name>, as `disco-twin run` does it: what is finished there is not done
@@ -21,6 +22,7 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -62,7 +64,7 @@ def set_of(name: str) -> list[Path]:
 def report(scenes: Sequence[Path], runs: Path, profile: Profile = "full", beside: Iterable[str] = ()) -> dict[str, Any]:
     """Run all scenes and put their figures together; `beside`: objects that do not count in the mean."""
     made: dict[str, dict[str, Any]] = {}
-    failed = []
+    failed, start = [], time.perf_counter()
     for scene in scenes:
         try:
             made[scene.stem] = object_figures(scene, runs / scene.stem, profile)
@@ -83,6 +85,7 @@ def report(scenes: Sequence[Path], runs: Path, profile: Profile = "full", beside
         "seconds": {name: figures["seconds"] for name, figures in made.items()},
         "memory": {name: figures["memory"] for name, figures in made.items()},
         "stages": {name: figures["stages"] for name, figures in made.items()},
+        "wall_s": time.perf_counter() - start,
         "failed": failed,
     }
 

@@ -13,6 +13,7 @@ import pytest
 
 from benchmarks import accuracy
 from benchmarks.__main__ import main
+from benchmarks.accuracy_table import BEGIN, END, filled
 from hw.base.errors import InputError
 from pipeline.capture.loop import Interrupted
 
@@ -93,6 +94,23 @@ def test_the_sets_are_apart() -> None:
     choose, score = (accuracy.set_of(name) for name in ("choose", "score"))
     assert (len(choose), len(score)) == (3, 4)
     assert not {path.stem for path in choose} & {path.stem for path in score}
+
+
+def test_the_page_takes_the_tables_of_a_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = {"a": figures("a", 0.2, 0.1), "b": figures("b", 0.1, 0.25), "c": InputError("too few points", key="points")}
+    record = reported(monkeypatch, made) | {"commit": "abc", "cores": 2}
+    page = f"# Page\n{BEGIN}old\n{END}rest\n"
+    text = filled(page, record)
+    assert text.startswith("# Page\n") and text.endswith(f"{END}rest\n") and "old" not in text
+    assert "| a | default | .200 | .200 | 3 | 300 |" in text
+    assert "|  | dipole | .100 * | .100 * | 1 | 200 |" in text
+    assert "| **mean of the set** | default | .150 | .150 |  |  |" in text
+    assert "Lost, 2 of 4 pairs" in text
+    assert "| a | uniform | dipole | .0300 | .0010 | 30 |" in text
+    assert "Failed: c (points: too few points" in text
+    assert filled(text, record) == text
+    with pytest.raises(ValueError, match="no lines"):
+        filled("# Page\n", record)
 
 
 @pytest.mark.slow

@@ -109,7 +109,7 @@ def test_the_accuracy_set_is_measured_alike(accuracy_set: dict[str, Scene], quic
     for scene in accuracy_set.values():
         assert scene.rig == quick.rig
         assert all(scene.rig.faults.model_dump().values())
-        assert scene.relight == quick.relight
+        assert (scene.relight.views, scene.relight.lights) == (quick.relight.views, quick.relight.lights)
         assert scene.simulation.truth_columns == 48
 
 
@@ -150,3 +150,19 @@ def test_the_accuracy_set_can_be_captured(
             pixels, _ = PinholeCamera.from_config(camera).seen_from(turn(np.deg2rad(angle))).project(mesh.vertices)
             margins.append(min(pixels.min(), (np.array([camera.width, camera.height]) - pixels).min()))
         assert (min(margins) < -10) if name == BEYOND_THE_FRAME else (min(margins) > 1), (name, margins)
+
+
+def test_necks_are_stated_where_objects_are_thinnest(
+    accuracy_set: dict[str, Scene], accuracy_objects: dict[str, TwinObject]
+) -> None:
+    assert {name for name, scene in accuracy_set.items() if scene.relight.neck} == {"figure", "gourd"}
+    for name in ("figure", "gourd"):
+        neck, mesh = accuracy_set[name].relight.neck, accuracy_objects[name].mesh
+        assert neck is not None
+        normal = np.array(neck.normal) / np.linalg.norm(neck.normal)
+        around = []
+        for height in (-4.0, 0.0, 4.0):
+            cut = mesh.section(plane_origin=np.array(neck.through_mm) + height * normal, plane_normal=normal)
+            assert len(cut.entities) == 1
+            around.append(cut.length)
+        assert around[1] < 0.65 * min(around[0], around[2]), (name, around)
