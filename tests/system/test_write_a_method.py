@@ -16,9 +16,11 @@ from frozen_run import NOISE, VIEWS, write_frozen_run
 
 import disco_twin
 from disco_twin.evaluate.opened_run import OpenedRun
+from disco_twin.evaluate.scores import score_images
 from disco_twin.experiment.run_folder import RunFolder
 from hw.base.errors import InputError
 from pipeline.geometry.fresnel import Boundary
+from pipeline.geometry.nominal_rig import CameraConfig
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
 
@@ -108,6 +110,29 @@ def test_a_perfect_model_scores_nothing_but_noise(followed: tuple[Path, np.ndarr
     assert (abs(scores.log10_rmse_completed.dropna("decade")) < 0.0046 / 2).all()
     assert (abs(scores.totals_mean - 1) < 4 * 0.01 / np.sqrt(80)).all()
     assert (abs(scores.totals_spread) < 0.01).all()
+
+
+def test_an_error_at_the_rim_is_the_rim_s_alone(run: OpenedRun) -> None:
+    """Rationale: images that are right but for the rim's pixels, which are twice as bright; and the other way round."""
+
+    def scored(at_rim: float, elsewhere: float) -> list[dict[str, float]]:
+        def image(_: str, light: str, view: CameraConfig) -> np.ndarray:
+            shape = slice(None), slice(view.height), slice(view.width)
+            pair = run.references.sel(layer="subsurface", light=light, view=view.name).mean("half").values[shape]
+            rim = run.rims.sel(view=view.name).values[shape[1:]]
+            return np.where(rim, at_rim, elsewhere) * pair
+
+        return score_images(run.experiment, run.folder, ("known",), image)
+
+    assert (run.rims <= run.masks).all()
+    assert 0 < float(run.rims.sum()) < 0.3 * float(run.masks.sum())
+    for row in scored(2.0, 1.0):
+        assert abs(row["nrmse"]) < NOISE
+        assert row["energy_ratio"] == pytest.approx(1, abs=NOISE)
+        assert row["rim_nrmse"] == pytest.approx(1, rel=0.05)
+    for row in scored(1.0, 1.5):
+        assert row["nrmse"] == pytest.approx(0.5, rel=0.02)
+        assert abs(row["rim_nrmse"]) < NOISE
 
 
 def test_images_are_read_at_random(run: OpenedRun) -> None:

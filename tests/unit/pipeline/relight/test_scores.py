@@ -48,6 +48,20 @@ def test_pixels_off_the_object_do_not_matter_and_neither_does_the_unit() -> None
     assert after.psnr == pytest.approx(before.psnr, rel=1e-9)
 
 
+def test_which_half_is_which_and_how_the_image_is_turned_does_not_matter() -> None:
+    """Rationale: the object turned by a quarter or a half turn in the image, or seen in a mirror: the same pixels."""
+    rng = np.random.default_rng(9)
+    truth = reference(rng)
+    a, b, model = truth + rng.normal(0, 0.1, SHAPE), truth + rng.normal(0, 0.1, SHAPE), 1.1 * truth
+    before = score_relit(model, a, b, MASK)
+    swapped = score_relit(model, b, a, MASK)
+    mirrored = score_relit(*(x.swapaxes(1, 2) for x in (model, a, b)), MASK.T)
+    half_turn = score_relit(*(x[:, ::-1, ::-1] for x in (model, a, b)), MASK[::-1, ::-1])
+    for after in (swapped, mirrored, half_turn):
+        for figure in ("nrmse", "nrmse_se", "nrmse_floor", "psnr", "energy_ratio"):
+            assert getattr(after, figure) == pytest.approx(getattr(before, figure), rel=1e-9), figure
+
+
 @pytest.mark.parametrize("correlated", [False, True])
 @pytest.mark.parametrize("error", [0.0, 0.03, 0.3])
 def test_unbiased_under_noise_with_an_honest_standard_error(error: float, correlated: bool) -> None:
