@@ -44,7 +44,8 @@ def load_mesh(path: Path, key: str | None = None) -> trimesh.Trimesh:
     if kind not in READERS:
         raise InputError("unknown type of mesh file", file=path, key=key, allowed=TYPES, remedy=EXPORT)
     try:
-        mesh = _mesh(READERS[kind](_bytes(path, kind)))
+        with np.errstate(all="ignore"):  # what is no number is refused by name
+            mesh = _mesh(READERS[kind](_bytes(path, kind)))
     except OSError as error:
         why = f" ({error.strerror})" if error.strerror else ""
         raise InputError(f"cannot be read{why}", file=path, key=key, remedy="correct the path") from error

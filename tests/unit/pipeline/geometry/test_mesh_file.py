@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -248,6 +249,28 @@ def test_what_is_no_mesh_is_refused_in_one_line(name: str, content: bytes, says:
         load_mesh(path, "key")
     said = str(caught.value)
     assert "\n" not in said and said.startswith(f"{path}: key: ") and ("Remedy: " in said or "allowed: " in said)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from([*FORMS]), st.lists(st.tuples(st.integers(0, 10_000), st.binary(max_size=4)), max_size=4))
+def test_damage_is_refused_or_harmless(
+    tmp_path_factory: pytest.TempPathFactory, form: str, changes: list[tuple[int, bytes]]
+) -> None:
+    """Bytes taken out, overwritten, put in: a mesh, or a refusal; no other error, and no warning."""
+    suffix, write = FORMS[form]
+    content = write(prism(L))
+    for at, new in changes:
+        content = content[: at % len(content)] + new + content[at % len(content) + 2 :]
+    with suppress(InputError):
+        loaded(tmp_path_factory.getbasetemp(), f"damaged{suffix}", content)
+
+
+def test_numbers_that_are_none_are_named_without_a_warning(tmp_path: Path) -> None:
+    """A signalling NaN, which NumPy warns of when it is converted."""
+    content = bytearray(stl_binary(np.random.default_rng(0).random((4, 3, 3))))
+    content[84 + 12 : 84 + 16] = b"\x01\x00\x80\x7f"
+    with pytest.raises(InputError, match="not a finite number"):
+        loaded(tmp_path, "a.stl", bytes(content))
 
 
 def test_what_cannot_be_opened(tmp_path: Path) -> None:

@@ -58,6 +58,14 @@ def test_dipole_model_depends_on_distance_alone(small: Synthetic) -> None:
     np.testing.assert_allclose(model.reflectance[0], model.reflectance[0].T, rtol=1e-6)
 
 
+def test_lambertian_does_with_spots_that_are_hardly_seen() -> None:
+    """A camera on the other side: no spot shows 30 % of its light, whose estimate is then what there is."""
+    s = make(spots=20, hidden=0.0, noise=0.0).samples
+    near = np.linalg.norm(s.spots.position[:, None] - np.asarray(s.mesh.vertices), axis=2) < 12
+    (term,) = fit_lambertian(replace(s, values=np.where(near, np.nan, s.values).astype(np.float32))).terms
+    assert np.isfinite(term.albedo).all() and (term.albedo > 0).all()
+
+
 def test_lambertian_albedo_is_the_energy_of_the_spots(small: Synthetic) -> None:
     (term,) = fit_lambertian(small.samples).terms
     area = RayMesh.of(small.samples.mesh).vertex_areas
