@@ -1,14 +1,16 @@
 """`disco-twin mesh`: a closed, outward oriented mesh from a scan with holes, edges of many triangles and loose pieces.
 
-MeshFix (Attene 2010) does it, piece by piece: it leaves the surface alone where it is sound. It is optional, and why it
+MeshFix (Attene 2010) does it, body by body: it leaves the surface alone where it is sound. It is optional, and why it
 and no other: docs/decisions/0107-mesh-files.md.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -16,12 +18,13 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from disco_twin.object.mesh import check_mesh, crossing, distance_to
-from hw.base.arrays import I64
+from hw.base.arrays import F64, I64
 from hw.base.errors import DiscoError, InputError
 from hw.base.files import write_atomically
 from pipeline.geometry.mesh_file import LARGEST_MM, SMALLEST_MM, load_mesh
 
 LEAST_SHARE = 0.01  # of the area, below which a piece is dropped
+CRACK = 1 / 30  # of the size: pieces whose borders come nearer are one body
 JOINED = 1e-6  # of the size: vertices of an open mesh that are nearer become one
 ROUNDS, INNER_ROUNDS = 10, 3  # of removing triangles that cross others, and closing what that opens: MeshFix's own
 BY_VOXELS = "remesh it with voxels in Blender or MeshLab, which keeps shape alone"
@@ -36,7 +39,7 @@ class Mended:
     bad_edges: int  # that did not join two triangles
     holes: int  # closed; those that taking out triangles had left are among them
     turned: bool  # some triangles were oriented inwards
-    pieces_kept: int
+    bodies: int  # that do not touch
     pieces_dropped: int
     dropped_share: float  # of the area
     scale: float
@@ -54,10 +57,8 @@ class Mended:
             ("edges", f"{self.bad_edges} did not join two triangles"),
             ("holes", f"{self.holes} closed"),
             ("orientation", "turned outward" if self.turned else "kept"),
-            (
-                "pieces",
-                f"{self.pieces_kept} kept, {self.pieces_dropped} dropped ({self.dropped_share:.2%} of the area)",
-            ),
+            ("pieces", f"{self.pieces_dropped} dropped, {self.dropped_share:.2%} of the area"),
+            ("bodies", f"{self.bodies}"),
             ("surface", f"new at most {self.off_mm:.3g} mm from old, old at most {self.lost_mm:.3g} mm from new"),
             ("scale", f"{self.scale:.6g}, then shifted by {x:.4g}, {y:.4g}, {z:.4g} mm"),
             ("result", f"{self.size_mm:.4g} mm large, {self.volume_mm3:.5g} mm^3"),
@@ -79,7 +80,7 @@ def mend(path: Path, out: Path, size_mm: float | None) -> Mended:
         raise InputError("no rig can scan that", key="--size-mm", value=size_mm, allowed=allowed, remedy=remedy)
     old = load_mesh(path)
     kept, repeated, dropped, share = _pieces(old)
-    mended, holes = zip(*(_closed(piece, path) for piece in kept), strict=True)
+    mended, holes = zip(*(_closed(body, path) for body in _bodies(kept)), strict=True)
     whole = trimesh.util.concatenate(_oriented(mended))
     scale = 1.0 if size_mm is None else size_mm / float(whole.extents.max())
     shift = np.zeros(3) if size_mm is None else -scale * whole.bounds.mean(axis=0)
@@ -99,8 +100,8 @@ def mend(path: Path, out: Path, size_mm: float | None) -> Mended:
         repeated_triangles=repeated,
         bad_edges=int((edges != 2).sum()),
         holes=sum(holes),
-        turned=not old.is_winding_consistent or old.volume < 0,
-        pieces_kept=len(kept),
+        turned=bool(not old.is_winding_consistent or old.volume < 0),
+        bodies=len(mended),
         pieces_dropped=dropped,
         dropped_share=share,
         scale=scale,
@@ -113,48 +114,80 @@ def mend(path: Path, out: Path, size_mm: float | None) -> Mended:
 
 
 def _pieces(mesh: trimesh.Trimesh) -> tuple[list[trimesh.Trimesh], int, int, float]:
-    """What hangs together by vertices, as soon as vertices that hardly differ are one; without repeated triangles.
+    """What hangs together by edges, as soon as vertices that hardly differ are one; without repeated triangles.
 
     Returns the pieces, how many triangles were repeated, how many pieces were dropped, and their share of the area.
     """
     points, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64)
     if not mesh.is_watertight:
         pairs = cKDTree(points).query_pairs(JOINED * float(mesh.extents.max()), output_type="ndarray")
-        faces = _groups(len(points), pairs)[1][faces]
+        label = _groups(len(points), pairs)
+        faces = np.unique(label, return_index=True)[1][label][faces]
         faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     first = np.sort(np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1])
-    repeated, faces = len(faces) - len(first), faces[first]
-    label = _groups(len(points), np.concatenate([faces[:, :2], faces[:, 1:]]))[0][faces[:, 0]]
-    area = np.bincount(label, trimesh.triangles.area(points[faces]))
-    share = area / area.sum()
-    large = np.flatnonzero(share >= LEAST_SHARE)
-    pieces = [trimesh.Trimesh(points, faces[label == k], process=False) for k in large]
+    pieces, shares = _by_edges(points, faces[first])
+    large = shares >= LEAST_SHARE
+    kept = [piece for piece, keep in zip(pieces, large, strict=True) if keep]
+    return kept, len(faces) - len(first), int((~large).sum()), float(shares[~large].sum())
+
+
+def _by_edges(points: F64, faces: I64) -> tuple[list[trimesh.Trimesh], F64]:
+    """The pieces of triangles that share edges, and each one's share of the area."""
+    ends = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edge = np.unique(ends, axis=0, return_inverse=True)[1].reshape(-1, 3)
+    label = _groups(int(edge.max()) + 1, np.concatenate([edge[:, :2], edge[:, 1:]]))[edge[:, 0]]
+    label = np.unique(label, return_inverse=True)[1]
+    areas = np.bincount(label, trimesh.triangles.area(points[faces]))
+    order = np.split(np.argsort(label, kind="stable"), np.cumsum(np.bincount(label))[:-1])
+    pieces = [trimesh.Trimesh(points, faces[own], process=False) for own in order]
     for piece in pieces:
         piece.remove_unreferenced_vertices()
-    dropped = np.setdiff1d(np.unique(label), large)
-    return pieces, repeated, len(dropped), float(share[dropped].sum())
+    return pieces, areas / areas.sum()
 
 
-def _groups(count: int, pairs: I64) -> tuple[I64, I64]:
-    """(count,) the group of each of `count` things, of which pairs belong together; (count,) the group's first."""
+def _groups(count: int, pairs: I64) -> I64:
+    """(count,) the group of each of `count` things, of which pairs belong together."""
     graph = sparse.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    label = np.asarray(sparse.csgraph.connected_components(graph, directed=False)[1], np.int64)
-    first = np.unique(label, return_index=True)[1]
-    return label, first[label]
+    return np.asarray(sparse.csgraph.connected_components(graph, directed=False)[1], np.int64)
 
 
-def _closed(piece: trimesh.Trimesh, path: Path) -> tuple[trimesh.Trimesh, int]:
-    """One piece, closed, and how many holes that took. Raises: DiscoError without MeshFix; InputError."""
-    if piece.is_watertight and piece.is_winding_consistent and crossing(piece) is None:
+def _bodies(pieces: list[trimesh.Trimesh]) -> list[list[trimesh.Trimesh]]:
+    """Pieces that are one surface: open ones whose borders come near each other, as along a crack."""
+    size = float(np.ptp(np.concatenate([p.bounds for p in pieces]), axis=0).max())
+    borders = []
+    for piece in pieces:
+        edges, count = np.unique(piece.edges_sorted, axis=0, return_counts=True)
+        borders.append(np.asarray(piece.vertices)[np.unique(edges[count != 2])])
+    near = [
+        (i, j)
+        for i, j in itertools.combinations([k for k, border in enumerate(borders) if len(border)], 2)
+        if np.min(cKDTree(borders[i]).query(borders[j])[0]) < CRACK * size
+    ]
+    label = _groups(len(pieces), np.array(near, np.int64).reshape(-1, 2))
+    return [[piece for piece, own in zip(pieces, label, strict=True) if own == body] for body in np.unique(label)]
+
+
+def _closed(pieces: list[trimesh.Trimesh], path: Path) -> tuple[trimesh.Trimesh, int]:
+    """One body, closed, and how many holes that took. Raises: DiscoError without MeshFix; InputError."""
+    (piece, *others) = pieces
+    if not others and piece.is_watertight and piece.is_winding_consistent and crossing(piece) is None:
         return piece, 0
     try:
         from pymeshfix import PyTMesh
     except ImportError as error:
         raise DiscoError("mending a mesh needs pymeshfix. Remedy: pip install 'disco-twin[mesh]'") from error
-    work = PyTMesh()
-    work.set_quiet(True)
-    work.load_array(np.array(piece.vertices, np.float64), np.array(piece.faces, np.int32))
-    work.remove_smallest_components()  # fins that loading has cut off
+
+    def meshfix(mesh: trimesh.Trimesh) -> Any:
+        work = PyTMesh()
+        work.set_quiet(True)
+        work.load_array(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int32))
+        return work
+
+    cut, shares = _by_edges(*meshfix(trimesh.util.concatenate(pieces)).return_arrays())  # where more than two meet
+    cut = [part for part, share in zip(cut, shares, strict=True) if share >= LEAST_SHARE]  # without fins
+    work = meshfix(trimesh.util.concatenate(cut))
+    if len(cut) > 1:
+        work.join_closest_components()
     holes = int(work.fill_small_boundaries(0, True))  # of any size, with triangles like those around
     if not work.clean(ROUNDS, INNER_ROUNDS):
         raise InputError("its triangles still cross each other after mending", file=path, remedy=BY_VOXELS)

@@ -98,6 +98,17 @@ def test_a_cavity_and_a_second_body_are_kept(tmp_path: Path) -> None:
     assert read_mesh(tmp_path / "out.ply").volume == pytest.approx(volume, rel=2e-3)
 
 
+def test_a_crack_all_around_is_closed(tmp_path: Path) -> None:
+    """Two halves of one scan are one body again, not the larger half."""
+    pytest.importorskip("pymeshfix")
+    halves = PEBBLE.copy()
+    halves.update_faces(np.abs(halves.triangles_center[:, 0]) > 0.3)
+    halves.export(tmp_path / "in.ply")
+    told = mend(tmp_path / "in.ply", tmp_path / "out.ply", None)
+    assert told.bodies == 1 and told.pieces_dropped == 0 and told.lost_mm < 0.1
+    assert read_mesh(tmp_path / "out.ply").volume == pytest.approx(PEBBLE.volume, rel=0.01)
+
+
 def test_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     torn = ball()
     torn.update_faces(np.arange(len(torn.faces)) > 3)
