@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -40,9 +42,12 @@ def test_cosines_and_rim_of_a_sphere() -> None:
     assert np.nan_to_num(exact, nan=0.0)[pixels.rim].max() < RIM_COSINE + 0.15
 
 
-def test_a_flat_object_seen_from_above_has_no_rim() -> None:
-    pixels = ObjectPixels.of(trimesh.creation.box(extents=(1.0, 30.0, 30.0)), VIEW)
+def test_a_pixel_that_is_partly_filled_has_the_cosine_of_what_it_shows() -> None:
+    """Rationale: a flat face seen from straight ahead: every cosine is nearly 1, in pixels at its edge, too."""
+    straight = replace(VIEW, pose=look_at(np.array([900.0, 0.0, 0.0]), (0, 0, 0)))
+    pixels = ObjectPixels.of(trimesh.creation.box(extents=(1.0, 30.2, 30.2)), straight)
     assert pixels.mask.any()
+    assert pixels.cosine[pixels.cosine > 0].min() > 0.99
     assert not pixels.rim.any()
 
 
