@@ -24,7 +24,7 @@ from disco_twin.experiment.ground_truth import true_exitance
 from disco_twin.light.transport import Transport
 from disco_twin.light.truth import Truth, standard_error, truth_columns
 from disco_twin.object.build import hat_basis
-from disco_twin.object.mesh import remesh
+from disco_twin.object.remesh import remesh
 from disco_twin.scene.scene import load_scene
 from pipeline.geometry.fresnel import Boundary
 from pipeline.model.reflectance import GlobalTerm
