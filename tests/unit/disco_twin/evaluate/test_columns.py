@@ -181,6 +181,19 @@ def test_pixels_of_a_perfect_image_have_the_noise_of_the_reference() -> None:
     assert ZScores.of(z_of_pixels(image, own**2, halves, lonely)) == ZScores(2 * 3, 0.0, 0.0)
 
 
+def test_where_no_photon_came_there_is_no_z_score() -> None:
+    """Rationale: entries that are zero in every replicate and have no variance in the model: nothing to divide by."""
+    replicates, model = truth(0.05).replicates.copy(), EXACT[:, COLUMNS].copy()
+    replicates[..., -5:], model[..., -5:] = 0.0, 0.0
+    dark = replace(truth(), replicates=replicates)
+    z = z_of_entries(model, 0 * model, dark)
+    whole = z_of_entries(EXACT[:, COLUMNS], 0 * model, truth(0.05))
+    assert 0 < sum(s.count for s in z.values()) < sum(s.count for s in whole.values())
+    assert all(np.isfinite(s.rms) for s in z.values() if s.count)
+    black = np.zeros((2, 3, 20, 20))
+    assert ZScores.of(z_of_pixels(black[0], black[0], black, np.ones((20, 20), bool))).count == 0
+
+
 def test_no_z_score_at_all() -> None:
     assert ZScores.of(np.array([np.nan])) == ZScores(0, None, None)
 
