@@ -20,12 +20,13 @@ from pipeline.geometry.mesh_file import with_area
 SHARP = np.deg2rad(40.0)  # between the normals on both sides of an edge that stays one
 STARTS = (1, 2, 4)  # triangles to begin with, per triangle that is wanted: where one start folds, another does not
 ROUNDS, SEARCHES = 20, 6
-COUNT_SHARE = 0.01  # by which the number of vertices may miss
+COUNT_SHARE, MOST_MISSED = 0.01, 0.1  # by which the number of vertices should miss at most, and may
 FITS = 2  # closest points move as the vertices do
 SLIVER = 1e-3  # height of a triangle relative to its longest edge
 TURNS = 3  # rounds of turning edges beside folded triangles
 LEAST_AREA = 0.05  # of the mean, that a triangle may have
 MOST_OFF = 0.03  # of the volume, or too much of area: a mesh that misses more does not resolve the object
+MOST_FOLDED = 0.01  # of the triangles, where no start leaves none
 STIFFNESS = 1e-6  # of the largest: holds what no point of the surface says anything about
 
 
@@ -37,17 +38,20 @@ def remesh(mesh: trimesh.Trimesh, vertices: int) -> trimesh.Trimesh:
     one too small. Raises: InputError where that many vertices do not resolve the object.
     """
     for sharp in (SHARP, np.inf):  # edges that are too close for so few vertices are rounded
+        found: list[tuple[int, trimesh.Trimesh]] = []
         for start in STARTS:
             out = _unfolded(_remeshed(mesh, vertices, start, sharp), mesh)
-            if not _closed(out):
+            if abs(len(out.vertices) / vertices - 1) > MOST_MISSED:
                 continue
-            fit = out
-            for _ in range(FITS):
-                fit = _fitted(fit, mesh)
-            moved = _balanced(out, fit, mesh) * (fit.vertices - out.vertices)
-            fit = trimesh.Trimesh(out.vertices + moved, out.faces, process=False)
-            if _closed(fit) and _resolves(fit, mesh):
+            fit = _of_its_size(out, mesh) if _closed(out) else out
+            if not _closed(fit) or max(fit.area / mesh.area - 1, abs(fit.volume / mesh.volume - 1)) > MOST_OFF:
+                continue  # too little area is roughness that was lost
+            found.append((len(_folded(fit, mesh)[0]), fit))
+            if found[-1][0] == 0:
                 return fit
+        folded, fit = min(found, key=lambda pair: pair[0], default=(len(mesh.faces), mesh))
+        if folded <= MOST_FOLDED * len(fit.faces):
+            return fit
     remedy = "raise scan.vertices, or leave it out to hand over the object's own mesh"
     raise InputError("so few do not resolve the object", key="scan.vertices", value=vertices, remedy=remedy)
 
@@ -120,12 +124,6 @@ def _closed(mesh: trimesh.Trimesh) -> bool:
     return bool(closed and areas.min() > LEAST_AREA * areas.mean())
 
 
-def _resolves(coarse: trimesh.Trimesh, fine: trimesh.Trimesh) -> bool:
-    """Whether no triangle is folded over, the volume is about right, and the area no larger: less is lost roughness."""
-    larger, off = coarse.area / fine.area - 1, abs(coarse.volume / fine.volume - 1)
-    return bool(max(larger, off) < MOST_OFF) and not len(_folded(coarse, fine)[0])
-
-
 def _folded(coarse: trimesh.Trimesh, fine: trimesh.Trimesh) -> tuple[I64, F64]:
     """Triangles that face away from the surface below their middle, or nearly have no area; (F, 3) its normals."""
     below = np.asarray(fine.faces)[closest(fine, np.array(coarse.triangles_center))[1]]
@@ -173,6 +171,21 @@ def _unfolded(coarse: trimesh.Trimesh, fine: trimesh.Trimesh) -> trimesh.Trimesh
     return coarse
 
 
+def _of_its_size(coarse: trimesh.Trimesh, fine: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Moved toward the best fit as far as area and volume are off by as much, with opposite signs."""
+
+    def off(of: trimesh.Trimesh) -> float:
+        return float(of.area / fine.area + of.volume / fine.volume - 2)
+
+    fit = coarse
+    for _ in range(FITS):
+        fit = _fitted(fit, fine)
+    before, after = off(coarse), off(fit)  # nearly linear between
+    share = float(np.clip(before / (before - after), 0.5, 1.0)) if abs(before - after) > 1e-9 else 1.0
+    moved = coarse.vertices + share * (fit.vertices - coarse.vertices)
+    return trimesh.Trimesh(moved, coarse.faces, process=False)
+
+
 def _fitted(coarse: trimesh.Trimesh, fine: trimesh.Trimesh) -> trimesh.Trimesh:
     """Vertices of `coarse` moved so that the squared distance of the surface of `fine` from it is least.
 
@@ -202,13 +215,3 @@ def _fitted(coarse: trimesh.Trimesh, fine: trimesh.Trimesh) -> trimesh.Trimesh:
     square += STIFFNESS * square.diagonal().max() * sparse.identity(square.shape[0], format="csc")
     amount = sparse.linalg.spsolve(square, matrix.T @ (weight * distance)).reshape(-1, 3)
     return trimesh.Trimesh(vertices + np.einsum("vde,ve->vd", direction, amount), faces, process=False)
-
-
-def _balanced(start: trimesh.Trimesh, end: trimesh.Trimesh, mesh: trimesh.Trimesh) -> float:
-    """The share of the way at which area and volume are off by as much, with opposite signs (both nearly linear)."""
-
-    def off(of: trimesh.Trimesh) -> F64:
-        return np.array([of.area / mesh.area - 1, of.volume / mesh.volume - 1])
-
-    before, after = off(start).sum(), off(end).sum()
-    return float(np.clip(before / (before - after), 0.5, 1.0)) if abs(before - after) > 1e-9 else 1.0
