@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from benchmarks.accuracy import RUNS, SCENES, report, set_of
+from benchmarks.accuracy import RUNS, SCENES, report, set_of, shrunken
 
 QUICK_OBJECT = "ring"  # what --quick runs, in the small profile
 
 
 def run(quick: bool = False) -> dict[str, Any]:
-    """The choosing set; `quick`: one object of it, shrunken."""
+    """The choosing set; `quick`: one object of it, shrunken, under two lights."""
     if quick:
-        return report([SCENES / "accuracy" / "choose" / f"{QUICK_OBJECT}.toml"], RUNS / "small", "small")
+        return shrunken(SCENES / "accuracy" / "choose" / f"{QUICK_OBJECT}.toml")
     return report(set_of("choose"), RUNS)

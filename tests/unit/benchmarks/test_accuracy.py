@@ -5,19 +5,20 @@ from __future__ import annotations
 import json
 import logging
 import math
-import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benchmarks import accuracy
+from benchmarks import accuracy, accuracy_choose
 from benchmarks.__main__ import main
 from benchmarks.accuracy_table import BEGIN, END, filled
+from disco_twin.scene.scene import load_scene
 from hw.base.errors import InputError
 from pipeline.capture.loop import Interrupted
 
 LIGHTS = ("uniform", "edge")
+LIGHTS_OF_QUICK = ("uniform", "directional")
 
 
 def figures(name: str, default: float, dipole: float, error: float = 1e-3) -> dict[str, Any]:
@@ -113,19 +114,26 @@ def test_the_page_takes_the_tables_of_a_record(monkeypatch: pytest.MonkeyPatch) 
         filled("# Page\n", record)
 
 
+@pytest.mark.parametrize("module", [accuracy, accuracy_choose])
+def test_quick_relights_one_object_of_the_set_under_two_lights(
+    module: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(accuracy, "RUNS", tmp_path)
+    monkeypatch.setattr(accuracy, "report", lambda *given: asked.append(given) or {})
+    module.run(quick=True)
+    ((scenes, runs, profile),) = asked
+    scene = load_scene(scenes[0], profile)
+    assert (scene.name, runs) == (module.QUICK_OBJECT, tmp_path / "small")
+    assert [light.name for light in scene.relight.lights] == list(LIGHTS_OF_QUICK)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_one_shrunken_object(
-    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """`python -m benchmarks accuracy --quick` from capture to record; again, and nothing is rendered again."""
-    folder = tmp_path / "accuracy" / "score"
-    folder.mkdir(parents=True)
-    text = (repository / "scenes" / "accuracy" / "score" / f"{accuracy.QUICK_OBJECT}.toml").read_text()
-    text = re.sub(r"reference_noise = [0-9.]+", "reference_noise = 0.06", text)
-    text = text.replace("[[relight.views]]", '[relight]\nlights = ["uniform", "directional"]\n\n[[relight.views]]', 1)
-    (folder / f"{accuracy.QUICK_OBJECT}.toml").write_text(text)
-    monkeypatch.setattr(accuracy, "SCENES", tmp_path)
     monkeypatch.setattr(accuracy, "RUNS", tmp_path / "runs")
     assert main(["accuracy", "--quick", "--json", str(tmp_path / "a.json")]) == 0
     record = json.loads((tmp_path / "a.json").read_text())
