@@ -42,7 +42,7 @@ class GlobalTerm(Term):
         if light not in self._spread:
             pairs = list(zip(light.flux, self.variance, strict=True))
             independent = np.stack([q**2 @ v for q, v in pairs])
-            self._spread[light] = independent, np.stack([np.abs(q) @ np.sqrt(v) for q, v in pairs])
+            self._spread[light] = independent, np.stack([_deviation(np.abs(q), v) for q, v in pairs])
         independent, alike = self._spread[light]
         return np.stack([view.image(independent, squared=True), view.image(alike) ** 2])
 
@@ -68,3 +68,9 @@ class GlobalTerm(Term):
         """The matrix's rows, which are its columns: R_d is symmetric."""
         variance = None if self.variance is None else self.variance[:, vertices]
         return ReflectanceColumns(self.reflectance[:, vertices], variance, self.measured[vertices])
+
+
+def _deviation(flux: F64, variance: F32) -> F64:
+    """(V,) sum of flux times the entries' deviations, some rows at a time: no second matrix of that size."""
+    rows = range(0, len(flux), 1024)
+    return np.asarray(sum(flux[u : u + 1024] @ np.sqrt(variance[u : u + 1024]) for u in rows), np.float64)
