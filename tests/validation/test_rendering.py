@@ -107,7 +107,7 @@ def test_references_are_what_the_plain_walk_makes(kind: str, name: str) -> None:
 def test_all_lights_on_all_boundaries(kind: str, alpha: float, eta: float, g: float, name: str) -> None:
     """The same for every kind of light, for glossy and dull boundaries, indices, and forward scattering."""
     obj = bumpy(kind, alpha, g)
-    compare(replace(obj, boundary=replace(obj.boundary, eta=eta)), name, 100_000)
+    compare(replace(obj, boundary=replace(obj.boundary, eta=eta)), name, 30_000)
 
 
 @pytest.mark.slow
