@@ -43,7 +43,7 @@ class Splitting:
 
 @dataclass(frozen=True)
 class Views:
-    """What photons are to reach, for windows that lead there: beams enter at `entries` (N, 3), and `seen` holds, per
+    """What photons are to reach, for windows that lead there: light enters at `entries` (N, 3), and `seen` holds, per
     view, the (M, 3) points of the surface that its pixels show; mm.
     """
 

@@ -2,7 +2,7 @@
 
 Which way a light is walked is a matter of its noise at equal time (docs/decisions/0054). A light that is the same from
 everywhere is met by every walk that leaves: walks start at the cameras' pixels. All others are walked from the light,
-with even connections to all cameras at once; a beam's photons are led to what the cameras see by weight windows.
+with even connections to all cameras at once, and weight windows that lead to what the cameras see.
 
 How many walks there are is decided by pilot runs with random numbers of their own, which are thrown away: the images'
 own values have no part in it, so stopping biases nothing.
@@ -27,7 +27,7 @@ from disco_twin.light.sources import light_source, sky_source
 from disco_twin.light.transport import Transport
 from hw.base.arrays import F32, F64
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.relight.lights import Beam, Environment, Light, Uniform
+from pipeline.relight.lights import Environment, Light, Uniform
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ PILOT_ENDS = 5.0  # times the noise that is asked for: a pilot costs a twentieth
 MARGIN = 1.15  # walks beyond what the last pilot asks for: its own noise is known to some per cent only
 MOST_WALKS = 1 << 27  # a half
 SHINE = 0.5  # variance of a walk that the surface reflects, beside its mean squared, roughly
-ENTRIES = 4096  # photons that tell where a beam enters
+ENTRIES = 4096  # photons that tell where a light enters
 
 Sky = Uniform | Environment
 Render = Callable[[int, int], F32]  # (walks a half, number of the run) -> (C, 2, 2, L, H, W)
@@ -82,7 +82,7 @@ def _to_noise(render: Render, noise: float, start: str) -> F32:
 
 def from_light(transport: Transport, light: Light, cameras: Sequence[PinholeCamera], seed: int) -> Render:
     """Walks that start at the light, for all cameras together."""
-    split = towards_views(transport, light, cameras) if isinstance(light, Beam) else None
+    split = towards_views(transport, light, cameras)
 
     def render(walks: int, run: int) -> F32:
         streams = len(HALVES) * run + np.arange(len(HALVES), dtype=np.uint32)
@@ -138,7 +138,7 @@ def _sky_image(
 
 
 def towards_views(transport: Transport, light: Light, cameras: Sequence[PinholeCamera]) -> Views | None:
-    """What windows lead a beam's photons to; None for a beam that misses the object, or where no camera sees it."""
+    """What windows lead a light's photons to; None for a beam that misses the object, or where no camera sees it."""
     source = light_source(light, transport.radius, range(transport.lasers))
     number = dr.arange(mi.UInt32, ENTRIES)
     start, direction, _ = source.launch(Rng.of(mi.UInt32(0), mi.UInt32(0), number), dr.zeros(mi.UInt32, ENTRIES), True)
