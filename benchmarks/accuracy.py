@@ -5,7 +5,8 @@
 
 objects     nrmse by object, method and light: the root of the mean over the views of their signed squares
 views       the same by view
-mean        by method and light, over the objects of the set alone (quick's figures stand beside it)
+mean        by method and light, over the objects of the set alone (quick's figures stand beside it); of those
+            that did not fail
 paired      rows of the default against each baseline: the difference of nrmse2, default less baseline (negative: the
             default is better), mean over the views, on the same reference halves and pixels; its standard error from
             their noise
@@ -89,7 +90,7 @@ def report(scenes: Sequence[Path], runs: Path, profile: Profile = "full", beside
     return {
         "objects": {name: figures["nrmse"] for name, figures in made.items()},
         "views": {name: figures["views"] for name, figures in made.items()},
-        "mean": means([figures["nrmse"] for name, figures in made.items() if name not in set(beside)]),
+        "mean": means([made[name]["nrmse"] for name in made if name not in set(beside)]),
         "paired": paired,
         "lost": [row for row in paired if row["difference"] > LOST * row["standard_error"]],
         "seconds": {name: figures["seconds"] for name, figures in made.items()},
@@ -123,7 +124,7 @@ def object_figures(scene: Path, folder: Path, profile: Profile) -> dict[str, Any
 def paired_rows(opened: Run) -> list[dict[str, Any]]:
     """Rows {object, light, baseline, difference, standard_error}: the default against every other method.
 
-    The errors of the two views are taken as independent.
+    One walk may serve both views, so their errors are taken as alike: no standard error of the mean is larger.
     """
     folder, relight = opened.folder, opened.scene.relight
     masks = {view.name: opened.experiment.object_pixels(view).inner for view in relight.views}
@@ -147,7 +148,7 @@ def paired_rows(opened: Run) -> list[dict[str, Any]]:
                     "light": light.name,
                     "baseline": baseline,
                     "difference": float(difference.mean()),
-                    "standard_error": float(np.sqrt((error**2).sum()) / len(pairs)),
+                    "standard_error": float(error.mean()),
                 }
             )
     return rows

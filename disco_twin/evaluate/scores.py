@@ -50,6 +50,8 @@ def score_run(experiment: Experiment, folder: RunFolder, methods: Sequence[str])
     relit = score_relit_images(experiment, folder, methods)
     columns = score_columns(experiment, folder, {m: partial(load_model, folder, m) for m in methods})
     for method, z in columns["z"].items():
+        if not any((folder.work / "relit-variance" / method).glob("*.npy")):
+            continue  # the model states one for its entries alone
         image, variance = partial(load_relit, folder, method), partial(load_variance, folder, method)
         z["pixels"] = z_of_images(experiment, folder, image, variance)
     write_json(folder.scores_file, {"format_version": FORMAT_VERSION, "relit": relit} | columns)

@@ -20,8 +20,9 @@ from pipeline.relight.scores import signed_root
 class TotalsScore:
     """A model's totals over the truth's, by wavelength, over some columns; None where there are too few.
 
-    columns: how many; mean: of the ratio; spread: its standard deviation relative to the mean, the truth's own noise
-    removed (signed root); mean_se, spread_se: standard errors from the columns' scatter
+    columns: how many, black ones too, which have no ratio; mean: of the ratio; spread: its standard deviation relative
+    to the mean, the truth's own noise removed (signed root); mean_se, spread_se: standard errors from the columns'
+    scatter
     """
 
     columns: int
@@ -50,9 +51,12 @@ def lit_vertices(samples: Samples) -> Bool:
 def score_totals(totals: F64, truth: Truth, chosen: Bool) -> TotalsScore:
     """totals: (L, n) a model's; chosen: (n,) the columns that count."""
     exact, error = (x[:, chosen] for x in true_totals(truth))
-    ratio, count = totals[:, chosen] / exact, int(chosen.sum())
-    rows = [_one(r, n) for r, n in zip(ratio, ratio * error / exact, strict=True)]
-    return TotalsScore(count, *zip(*rows, strict=True))
+    rows = []
+    for own, true, noise in zip(totals[:, chosen], exact, error, strict=True):
+        light = true > 0  # a wavelength may be absorbed wholly
+        ratio = own[light] / true[light]
+        rows.append(_one(ratio, ratio * noise[light] / true[light]))
+    return TotalsScore(int(chosen.sum()), *zip(*rows, strict=True))
 
 
 def _one(ratio: F64, noise: F64) -> tuple[float | None, float | None, float | None, float | None]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import convolve1d
 
 from disco_twin.evaluate.entries import DECADES, below_peak
 from disco_twin.evaluate.totals import true_totals
@@ -39,10 +39,10 @@ class ZScores:
 
 
 def _over(error: Array, variance: Array) -> F64:
-    """error / sqrt(variance), NaN where nothing is known to vary: a place that no photon reached."""
+    """error / sqrt(variance), NaN where there is none: no photon came, or nothing is known of how many might."""
     deviation = np.sqrt(variance, dtype=np.float64)
     out: F64 = np.full(deviation.shape, np.nan)
-    np.divide(error, deviation, out=out, where=deviation > 0)
+    np.divide(error, deviation, out=out, where=(deviation > 0) & np.isfinite(deviation))
     return out
 
 
@@ -96,8 +96,10 @@ def reference_variance(a: F64, b: F64, mask: Bool) -> F64:
     """
 
     def around(values: F64) -> F64:
-        size = (*np.ones(values.ndim - 2, int), WINDOW, WINDOW)
-        return np.asarray(uniform_filter(np.where(mask, values, 0.0), size, mode="constant"))
+        out, weights = np.where(mask, values, 0.0), np.full(WINDOW, 1.0 / WINDOW)
+        for axis in (-2, -1):  # no running sum, whose rounding would trail behind bright pixels
+            out = convolve1d(out, weights, axis, mode="constant")
+        return np.asarray(out)
 
     share = around(np.ones(mask.shape))
     count = np.rint(share * WINDOW**2)

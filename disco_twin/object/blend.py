@@ -110,7 +110,9 @@ def _marching_cubes(config: Blend, function: Function) -> trimesh.Trimesh:
     grid = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
     values = function(grid)
     if not (values < 0).any():
-        raise InputError("carving leaves nothing of the blend", key=f"{KEY}.parts", remedy="carve less")
+        if any(part.carve for part in config.parts):
+            raise InputError("carving leaves nothing of the blend", key=f"{KEY}.parts", remedy="carve less")
+        raise InputError(f"all parts are thinner than {cell:.2g} mm", key=f"{KEY}.parts", remedy="make them larger")
     off = SNAP * cell  # no grid point on the surface or next to it: there would be triangles without area
     values = np.where(np.abs(values) < off, np.copysign(off, values), values)
     nx, ny, nz = (int(n) for n in counts)

@@ -23,7 +23,8 @@ from hw.base.errors import DiscoError, InputError
 from hw.base.files import write_atomically
 from pipeline.geometry.mesh_file import LARGEST_MM, SMALLEST_MM, load_mesh
 
-LEAST_SHARE = 0.01  # of the area, below which a piece is dropped
+LEAST_SHARE = 0.01  # of the largest piece's area, below which a piece is dropped
+MOST_PIECES = 200  # beyond which there are no pieces, but triangles that have lost each other
 CRACK = 1 / 30  # of the size: pieces whose borders come nearer are one body
 JOINED = 1e-6  # of the size: vertices of an open mesh that are nearer become one
 ROUNDS, INNER_ROUNDS = 10, 3  # of removing triangles that cross others, and closing what that opens: MeshFix's own
@@ -79,7 +80,7 @@ def mend(path: Path, out: Path, size_mm: float | None) -> Mended:
         allowed, remedy = f"{SMALLEST_MM:g} .. {LARGEST_MM:g}", "choose another size"
         raise InputError("no rig can scan that", key="--size-mm", value=size_mm, allowed=allowed, remedy=remedy)
     old = load_mesh(path)
-    kept, repeated, dropped, share = _pieces(old)
+    kept, repeated, dropped, share = _pieces(old, path)
     mended, holes = zip(*(_closed(body, path) for body in _bodies(kept)), strict=True)
     whole = trimesh.util.concatenate(_oriented(mended))
     scale = 1.0 if size_mm is None else size_mm / float(whole.extents.max())
@@ -113,10 +114,11 @@ def mend(path: Path, out: Path, size_mm: float | None) -> Mended:
     )
 
 
-def _pieces(mesh: trimesh.Trimesh) -> tuple[list[trimesh.Trimesh], int, int, float]:
+def _pieces(mesh: trimesh.Trimesh, path: Path) -> tuple[list[trimesh.Trimesh], int, int, float]:
     """What hangs together by edges, as soon as vertices that hardly differ are one; without repeated triangles.
 
     Returns the pieces, how many triangles were repeated, how many pieces were dropped, and their share of the area.
+    Raises: InputError.
     """
     points, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64)
     if not mesh.is_watertight:
@@ -124,9 +126,14 @@ def _pieces(mesh: trimesh.Trimesh) -> tuple[list[trimesh.Trimesh], int, int, flo
         label = _groups(len(points), pairs)
         faces = np.unique(label, return_index=True)[1][label][faces]
         faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    if not len(faces):
+        raise InputError("encloses nothing", file=path, remedy=BY_VOXELS)
     first = np.sort(np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1])
     pieces, shares = _by_edges(points, faces[first])
-    large = shares >= LEAST_SHARE
+    large = shares >= LEAST_SHARE * shares.max()
+    if large.sum() > MOST_PIECES:
+        remedy = "merge vertices by distance in the program that made it, then repeat the command"
+        raise InputError(f"falls into {large.sum()} pieces that share no edge", file=path, remedy=remedy)
     kept = [piece for piece, keep in zip(pieces, large, strict=True) if keep]
     return kept, len(faces) - len(first), int((~large).sum()), float(shares[~large].sum())
 
@@ -183,8 +190,11 @@ def _closed(pieces: list[trimesh.Trimesh], path: Path) -> tuple[trimesh.Trimesh,
         work.load_array(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int32))
         return work
 
-    cut, shares = _by_edges(*meshfix(trimesh.util.concatenate(pieces)).return_arrays())  # where more than two meet
-    cut = [part for part, share in zip(cut, shares, strict=True) if share >= LEAST_SHARE]  # without fins
+    points, triangles = meshfix(trimesh.util.concatenate(pieces)).return_arrays()
+    if not len(triangles):
+        raise InputError("encloses nothing", file=path, remedy=BY_VOXELS)
+    cut, shares = _by_edges(points, triangles)  # where more than two meet
+    cut = [part for part, share in zip(cut, shares, strict=True) if share >= LEAST_SHARE * shares.max()]  # without fins
     work = meshfix(trimesh.util.concatenate(cut))
     if len(cut) > 1:
         work.join_closest_components()

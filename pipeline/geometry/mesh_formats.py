@@ -27,6 +27,7 @@ PLY_TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 BYTE_ORDER = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+MOST_VERTICES = 1 << 40  # more than any file holds, and far from what an index can be
 STL_HEAD, STL_FACET = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 STL_VERTEX = re.compile(rb"^[ \t]*vertex[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)[ \t]*\r?$", re.I | re.M)
 
@@ -68,7 +69,7 @@ def read_ply(data: bytes) -> Polygons:
         if {"vertex", "face"} <= found.keys():
             break
     vertex, face = found.get("vertex", {}), found.get("face", {})
-    if not {"x", "y", "z"} <= vertex.keys():
+    if any(axis not in vertex or isinstance(vertex[axis], Lists) for axis in "xyz"):
         raise InputError("the mesh is empty (no vertices with x, y and z)")
     vertices = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
     lists = face.get("vertex_indices", face.get("vertex_index"))
@@ -92,6 +93,8 @@ def _ply_header(data: bytes) -> tuple[str, list[tuple[str, int, list[Column]]], 
                 case ["element", name, count] if count.isdecimal():
                     elements.append((name, int(count), []))
                 case ["property", "list", length, of, name]:
+                    if PLY_TYPES[length].startswith("f"):
+                        raise ValueError("a list's length is no fraction")
                     elements[-1][2].append(Column(name, PLY_TYPES[of], PLY_TYPES[length]))
                 case ["property", of, name]:
                     elements[-1][2].append(Column(name, PLY_TYPES[of], None))
@@ -240,7 +243,7 @@ def read_obj(data: bytes) -> Polygons:
             polygon = [int(word.partition(b"/")[0]) for word in words[1:]]
         except ValueError as error:
             raise InputError(f"line {number} cannot be read: {line.decode('latin-1').strip()[:60]!r}") from error
-        if 0 in polygon or min(polygon, default=0) < -len(vertices):
+        if 0 in polygon or min(polygon, default=0) < -len(vertices) or max(polygon, default=0) > MOST_VERTICES:
             raise InputError(f"line {number}: a triangle names a vertex that does not exist")
         corners += [v - 1 if v > 0 else len(vertices) + v for v in polygon]  # from the vertices read so far
         sizes.append(len(polygon))

@@ -80,6 +80,15 @@ def test_lit_and_unlit_columns_are_apart_and_too_few_have_no_spread() -> None:
     json.dumps(dark.spread, allow_nan=False)
 
 
+def test_a_wavelength_that_is_absorbed_wholly_has_no_totals() -> None:
+    exact = truth(0.05)
+    replicates = exact.replicates.copy()
+    replicates[:, 1] = 0.0
+    s = score_totals(totals(), replace(exact, replicates=replicates), ALL)
+    assert s.mean[1] is None and s.spread[1] is None
+    assert s.mean[0] == pytest.approx(1.0, abs=0.05)
+
+
 def test_totals_are_sums_over_area() -> None:
     """Rationale: a mesh with larger hats on one side; the same light leaves however finely it is counted."""
     area = AREA * np.where(MESH.vertices[:, 0] > 0, 2.0, 0.5)
@@ -178,7 +187,7 @@ def test_pixels_of_a_perfect_image_have_the_noise_of_the_reference() -> None:
     lonely = np.zeros_like(mask)
     lonely[10, 10] = lonely[50, 50] = True
     assert not np.isfinite(reference_variance(*halves, lonely)).any()
-    assert ZScores.of(z_of_pixels(image, own**2, halves, lonely)) == ZScores(2 * 3, 0.0, 0.0)
+    assert ZScores.of(z_of_pixels(image, own**2, halves, lonely)) == ZScores(0, None, None)
 
 
 def test_where_no_photon_came_there_is_no_z_score() -> None:
@@ -192,6 +201,17 @@ def test_where_no_photon_came_there_is_no_z_score() -> None:
     assert all(np.isfinite(s.rms) for s in z.values() if s.count)
     black = np.zeros((2, 3, 20, 20))
     assert ZScores.of(z_of_pixels(black[0], black[0], black, np.ones((20, 20), bool))).count == 0
+
+
+def test_a_bright_pixel_does_not_disturb_the_noise_beside_it() -> None:
+    """Rationale: ten decades in one image, as from behind. Expected: far from the bright pixel, the same variance."""
+    rng = np.random.default_rng(5)
+    halves = 1e-6 * rng.standard_normal((2, 1, 40, 60))
+    mask = np.ones((40, 60), bool)
+    alone = reference_variance(*halves, mask)
+    halves[:, 0, 20, 20] = 1e4, -1e4
+    both = reference_variance(*halves, mask)
+    np.testing.assert_allclose(both[0, :, 40:], alone[0, :, 40:], rtol=1e-9)
 
 
 def test_no_z_score_at_all() -> None:

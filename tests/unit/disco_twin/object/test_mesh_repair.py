@@ -109,6 +109,20 @@ def test_a_crack_all_around_is_closed(tmp_path: Path) -> None:
     assert read_mesh(tmp_path / "out.ply").volume == pytest.approx(PEBBLE.volume, rel=0.01)
 
 
+def test_many_bodies_are_kept_and_triangles_that_have_lost_each_other_are_refused(tmp_path: Path) -> None:
+    """Each of 120 boxes has less than a hundredth of the area; a soup of triangles has no two that share an edge."""
+    pytest.importorskip("pymeshfix")
+    boxes = [trimesh.creation.box((1, 1, 1)).apply_translation([3 * (k % 12), 3 * (k // 12), 0]) for k in range(120)]
+    trimesh.util.concatenate(boxes).export(tmp_path / "boxes.ply")
+    assert mend(tmp_path / "boxes.ply", tmp_path / "out.ply", None).bodies == 120
+    soup = ball()
+    corners = np.asarray(soup.triangles).reshape(-1, 3)
+    corners = corners + 1e-3 * np.random.default_rng(1).standard_normal(corners.shape)
+    trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False).export(tmp_path / "soup.ply")
+    with pytest.raises(InputError, match=r"falls into .* pieces that share no edge. Remedy: merge"):
+        mend(tmp_path / "soup.ply", tmp_path / "soup-out.ply", None)
+
+
 def test_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     torn = ball()
     torn.update_faces(np.arange(len(torn.faces)) > 3)

@@ -209,6 +209,13 @@ FACE = b"element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0
         ("a.ply", HEAD + FACE + b"3 0 1\n", "ends before its 1 elements 'face'"),
         ("a.ply", HEAD + FACE + b"3 0 1 x\n", "'face' are not all numbers"),
         ("a.ply", HEAD + FACE + b"3 0 1 1.5\n", "by a fraction"),
+        (
+            "a.ply",
+            HEAD.replace(b"float x", b"list uchar float x") + b"end_header\n" + 3 * b"1 0 0 0\n",
+            "no vertices with x, y",
+        ),
+        ("a.ply", HEAD + FACE.replace(b"list uchar", b"list float") + b"3 0 1 2\n", "cannot be read at 'property list"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 99999999999999999999 1 2\n", "line 4: a triangle names a vertex"),
         ("a.ply", HEAD + FACE + b"3 0 1 3\n", "does not exist"),
         ("a.ply", HEAD + FACE + b"3 0 1 -1\n", "does not exist"),
         ("a.ply", HEAD + FACE.replace(b"9 0 0", b"nan 0 0") + b"3 0 1 2\n", "not a finite number"),
