@@ -10,9 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import trimesh
+from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
 from disco_twin.experiment.experiment import Experiment
@@ -22,11 +24,11 @@ from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import Boundary, mean_transmittance, transmittance
 from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.pixel_footprints import trace_pixels
+from pipeline.reconstruct.global_term.boundary_fit import EDGES
 from pipeline.reconstruct.samples.spots import Spots
 from pipeline.relight.irradiance import hat_moments
 from pipeline.relight.lights import Light
 
-EDGES = np.array([0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0 + 1e-9])
 SUPERSAMPLE = 3
 SAMPLE_WALKS, REPLICATES = 30_000, 4  # of a spot's exact samples; those whose spread is their noise
 SPOTS_AT_ONCE = 25
@@ -75,7 +77,7 @@ class ExactLight:
         """As `entering`, as a model on the scan knows it: projected onto the scan's hat functions."""
         lasers = self.experiment.transport.lasers
         moments = hat_moments(light, self.scan, boundary, lasers)
-        density = self.consistent(moments) / self.mean
+        density = _solved(RayMesh.of(self.scan).mass_matrix, moments) / self.mean
         return np.asarray((self.basis @ density.T).T)
 
     def after_diffuse_entry(
@@ -163,15 +165,20 @@ class ExactLight:
         """(..., V) W/mm^2 on the scan's vertices from (..., V_fine) W: mean over each hat, or projected onto them."""
         moments = np.asarray((self.basis.T @ power.reshape(-1, power.shape[-1]).T).T)
         if consistent:
-            out = self.consistent(moments)
+            out = _solved(self._mass, moments)
         else:
             out = moments / (self.basis.T @ self.areas)
         return np.asarray(out.reshape(*power.shape[:-1], -1) / self.mean)
 
-    def consistent(self, moments: F64) -> F64:
-        """(N, V) coefficients on the scan's hat functions whose moments are these (mass matrix)."""
-        solved = sparse_linalg.spsolve(RayMesh.of(self.scan).mass_matrix, moments.T)
-        return np.asarray(solved.reshape(len(self.scan.vertices), -1).T)
+    @cached_property
+    def _mass(self) -> sparse.csc_array:
+        """(V, V) mm^2, products of the scan's hat functions integrated over the object, where light leaves."""
+        return sparse.csc_array(self.basis.T @ RayMesh.of(self.mesh).mass_matrix @ self.basis)
+
+
+def _solved(mass: sparse.csc_array, moments: F64) -> F64:
+    """(N, V) coefficients of hat functions from their (N, V) moments."""
+    return np.asarray(sparse_linalg.spsolve(mass, moments.T).reshape(mass.shape[0], -1).T)
 
 
 def _footprint(vertices: F64, spots: Spots, spot: int) -> F64:
@@ -191,7 +198,7 @@ def best_curve(mesh: trimesh.Trimesh, eta: float, seen: Sequence[SeenRadiosity])
     observed, expected = np.zeros(len(EDGES) - 1), np.zeros(len(EDGES) - 1)
     for one in seen:
         camera = one.camera
-        scale = 1.0 / max(float(one.reference.max()), 1e-300)  # all lights count alike
+        scale = 1.0 / max(float(one.reference.mean()), 1e-300)  # all lights count alike
         flat = one.reference.sum(axis=0).ravel() * scale
         model = one.radiosity.sum(axis=0) * scale
         for band in trace_pixels(mesh, camera, SUPERSAMPLE):

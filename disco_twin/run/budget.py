@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from disco_twin.camera.lars3 import Lars3
@@ -45,7 +46,7 @@ from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import Boundary
 from pipeline.reconstruct.methods import reconstruct
 from pipeline.reconstruct.samples.samples_file import load_samples
-from pipeline.relight.on_mesh import ViewOfMesh
+from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 from pipeline.relight.scores import Unscorable, score_halves, signed_root
 
 FORMAT_VERSION = 2
@@ -304,7 +305,7 @@ class _Groups:
         """
         own = load_samples(self.folder.work / "samples.npz")
         value, variance = self.exact.spot_responses(own.spots)
-        observed = np.isfinite(own.values)
+        observed = np.isfinite(own.values) & (value > 0)  # where no photon came nothing is known
         nothing = np.zeros(own.values.shape, np.float32)
         samples = replace(
             own,
@@ -315,12 +316,15 @@ class _Groups:
             direction_bias=np.zeros_like(own.direction_bias),
             glow=(),
         )
-        model = replace(reconstruct(samples, self.method), boundary=self.kept_curve())
-        lit = {light.name: model.lit_by(light) for light in self.run.scene.relight.lights}
+        model, smooth = reconstruct(samples, self.method), Boundary(self.eta)
+        # As the rows of light: the floor's curve at the exit, the smooth F_t at the entry.
+        lit = {x.name: LightOnMesh(x, model.mesh, smooth, model.lasers) for x in self.run.scene.relight.lights}
         out: dict[tuple[str, str], NDArray[np.floating]] = {}
         for view, camera in zip(self.views, self.cameras, strict=True):
-            seen = model.seen_by(camera)
-            out |= {(name, view.name): _twice(model.image(light, seen)) for name, light in lit.items()}
+            seen = ViewOfMesh(camera, model.mesh, self.kept_curve())
+            for name, light in lit.items():
+                total = np.sum([term.image(light, seen) for term in model.terms], axis=0)
+                out[name, view.name] = _twice(total)
         return {EXACT_SAMPLES: out}
 
     # ---- the whole job
@@ -392,23 +396,28 @@ class _Curve(Strict):
 
 
 class _Quiet(Lars3):
-    """The camera with the expectation in place of each random number."""
+    """The camera whose photons and electronics do not fluctuate; a dither of one digital number keeps means right."""
 
     def expose(self, radiance: F32, laser: int, rng: Any, exponent: int | None = None) -> RawImage:
         """As `Lars3.expose`."""
-        return super().expose(radiance, laser, _Expectation(), exponent)  # type: ignore[arg-type]
+        dither = self.sensor.gain_e_per_dn / max(self.sensor.read_noise_e, 1e-9)
+        return super().expose(radiance, laser, _Expectation(rng, dither), exponent)  # type: ignore[arg-type]
 
 
+@dataclass(frozen=True)
 class _Expectation:
-    """Stands for a generator."""
+    """Stands for a generator. dither: width of a uniform number in place of the normal one of the read-out."""
+
+    rng: Generator
+    dither: float
 
     def poisson(self, mean: F64) -> F64:
         """The mean itself."""
         return mean
 
     def standard_normal(self, shape: Sequence[int]) -> F64:
-        """Zeros."""
-        return np.zeros(shape)
+        """Uniform, of the dither's width."""
+        return self.dither * self.rng.uniform(-0.5, 0.5, shape)
 
 
 def _twice(image: F32) -> NDArray[np.floating]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from refusals import Says
 
@@ -45,8 +46,10 @@ def test_a_part_that_helps_costs_less_than_nothing_and_what_is_missing_costs_not
 
 
 def test_the_quiet_camera_draws_expectations() -> None:
-    quiet = Expectation()
-    assert quiet.poisson(3.7) == 3.7 and (quiet.standard_normal((2, 2)) == 0).all()  # type: ignore[arg-type]
+    quiet = Expectation(np.random.default_rng(1), 0.5)
+    assert quiet.poisson(3.7) == 3.7  # type: ignore[arg-type]
+    drawn = quiet.standard_normal((1000,))
+    assert np.abs(drawn).max() <= 0.25 and abs(drawn.mean()) < 0.02
 
 
 def test_a_run_that_is_not_finished_has_no_budget(tmp_path: Path, says: Says) -> None:
