@@ -34,7 +34,9 @@ log = logging.getLogger(__name__)
 FIRST_PILOT = {"light": 1 << 14, "pixel": 4}  # walks a half, of a light or of a pixel
 PILOT_ENDS = 5.0  # times the noise that is asked for: a pilot costs a twentieth of the image
 MARGIN = 1.15  # walks beyond what the last pilot asks for: its own noise is known to some per cent only
-MOST_WALKS = 1 << 27  # a half
+MOST_WALKS = {"light": 1 << 27, "pixel": 1 << 14}  # a half
+BLACK_AFTER = {"light": 1 << 20, "pixel": 64}  # walks a half that have to find nothing before an image counts as black
+SHINE_RUN = 31  # number of the run that looks from the pixels at what the surface reflects: no pilot gets there
 SHINE = 0.5  # variance of a walk that the surface reflects, beside its mean squared, roughly
 ENTRIES = 4096  # photons that tell where a light enters
 
@@ -49,11 +51,12 @@ def render_reference(
     each. Both halves are made of the same number of walks.
     """
     if isinstance(light, Uniform | Environment) and alike_from_everywhere(light):
-        return [_to_noise(from_pixels(transport, light, camera, noise, seed), noise, "pixel")[0] for camera in cameras]
+        renders = [from_pixels(transport, light, camera, noise, seed + k) for k, camera in enumerate(cameras)]
+        return [_to_noise(render, noise, "pixel")[0] for render in renders]
     images = list(_to_noise(from_light(transport, light, cameras, seed), noise, "light"))
     if isinstance(light, Environment):  # few photons are reflected towards a camera: look from there instead
-        for image, camera in zip(images, cameras, strict=True):
-            image[:, LAYERS.index("surface")] = reflected_sky(transport, light, camera, noise, seed)
+        for k, (image, camera) in enumerate(zip(images, cameras, strict=True)):
+            image[:, LAYERS.index("surface")] = reflected_sky(transport, light, camera, noise, seed + k)
     return images
 
 
@@ -66,18 +69,22 @@ def _to_noise(render: Render, noise: float, start: str) -> F32:
     """The images with the noise asked for in each."""
     walks = FIRST_PILOT[start]
     for run in itertools.count(1):
-        found = max(noise_of(image) for image in render(walks, run))
+        found = max(_pilot_noise(image, walks >= BLACK_AFTER[start]) for image in render(walks, run))
         needed = walks * (found / noise) ** 2 * MARGIN
-        if found <= PILOT_ENDS * noise or 4 * walks > MOST_WALKS:
+        if found <= PILOT_ENDS * noise or 4 * walks > MOST_WALKS[start]:
             break
         walks *= 4
-    if needed > MOST_WALKS:
-        log.warning(
-            "a reference keeps %.0f %% noise: more than %d walks",
-            100 * found / math.sqrt(needed / MOST_WALKS),
-            MOST_WALKS,
-        )
-    return render(int(min(max(needed, 1), MOST_WALKS)), 0)
+    images = render(int(min(max(needed, 1), MOST_WALKS[start])), 0)
+    for kept in (noise_of(image) for image in images):
+        if kept > MARGIN * noise:
+            log.warning("a reference keeps %.0f %% noise, of which %.0f %% were to be left", 100 * kept, 100 * noise)
+    return images
+
+
+def _pilot_noise(image: F32, enough: bool) -> float:
+    """`noise_of` a pilot; that few walks found nothing does not say that there is nothing."""
+    found = noise_of(image)
+    return math.inf if found == 0.0 and not enough else found
 
 
 def from_light(transport: Transport, light: Light, cameras: Sequence[PinholeCamera], seed: int) -> Render:
@@ -111,7 +118,7 @@ def from_pixels(transport: Transport, light: Sky, camera: PinholeCamera, noise: 
 def reflected_sky(transport: Transport, light: Sky, camera: PinholeCamera, noise: float, seed: int) -> F32:
     """(2, L, H, W) both halves of what the surface reflects of a light from all around."""
     walks = max(1, round(SHINE / noise**2))
-    image = _sky_image(transport, light, camera, walks, seed, len(HALVES), shine=True)
+    image = _sky_image(transport, light, camera, walks, seed, SHINE_RUN, shine=True)
     return np.asarray(image[:, LAYERS.index("surface")])
 
 

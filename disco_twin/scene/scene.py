@@ -125,7 +125,7 @@ def shrink(scene: Scene) -> Scene:
         walks_per_spot=max(1000, walks.walks_per_spot // 10),
         truth_columns=min(walks.truth_columns, max(4, walks.truth_columns // 4)),
         truth_walks=max(1000, walks.truth_walks // 10),
-        reference_noise=min(1.0, walks.reference_noise * math.sqrt(10)),
+        reference_noise=max(walks.reference_noise, min(0.1, walks.reference_noise * math.sqrt(10))),
     )
     cameras = tuple(half(camera) for camera in scene.rig.cameras)
     spots = min(scene.rig.spots, max(20, scene.rig.spots // 4))
