@@ -25,7 +25,7 @@ class SimulationConfig(Strict):
     """
 
     walks_per_spot: Count = 200_000
-    truth_columns: Count = 24  # scan vertices whose column of R_d is computed as ground truth
+    truth_columns: Count = 24  # scan vertices from which the true exitance per irradiance is computed
     truth_walks: Count = 500_000  # a column, with weight windows
     reference_noise: Annotated[float, Field(ge=0.002, le=1)] = 0.03  # rms over a reference image, of its rms light
 
