@@ -20,7 +20,7 @@ def example(repository: Path, number: int, folder: Path) -> str:
 
 
 def test_the_twin_answers_a_question(repository: Path) -> None:
-    assert example(repository, 0, repository).count("R_d") == 4
+    assert example(repository, 0, repository).count("1/mm^2") == 4
 
 
 def test_a_run_folder_opens_as_arrays(repository: Path, tmp_path: Path) -> None:

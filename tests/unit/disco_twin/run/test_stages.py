@@ -72,7 +72,7 @@ ALL = {"scan", "targets", "capture", "truth", "references", "pipeline", "scores"
         ("disco_twin.light.walk", ALL - {"targets"}),
         ("disco_twin.emulation.twin_rig", {"targets", "capture", "pipeline", "scores"}),
         ("disco_twin.camera.targets", {"targets", "pipeline", "scores"}),
-        ("pipeline.geometry.fresnel", {"truth", "pipeline", "scores"}),
+        ("pipeline.geometry.fresnel", {"pipeline", "scores"}),
         ("pipeline.reconstruct.global_term.completion", {"pipeline", "scores"}),
         ("pipeline.relight.scores", {"scores"}),
         ("disco_twin.evaluate.summary", set()),
