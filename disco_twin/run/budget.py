@@ -202,7 +202,7 @@ class _Groups:
             names = [NOMINAL, *VARIANTS]
             groups |= {name: (job, lambda name=name: {name: self.recalibrated(own, name)}) for name in names}  # type: ignore[misc]
         else:
-            left_out |= dict.fromkeys(["calibration"], "it was not measured: there is nothing to make true")
+            left_out["calibration"] = "it was not measured: there is nothing to make true"
         if self.folder.taken_by_devices:
             left_out |= dict.fromkeys(["the scanner", "camera noise"], "devices took these images")
             return groups, left_out
