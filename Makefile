@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 OUT ?= out/quick
 
-.PHONY: demo test lint validate install references accuracy picture curves clean
+.PHONY: demo test lint validate install references outside accuracy picture curves clean
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -15,6 +15,7 @@ help:
 	@echo "make lint      style, types, import rules"
 	@echo "make validate  the slow tests as well: the figures that quick must reach, among them"
 	@echo "make references  render the reference images of quick and of the accuracy set that are missing (hours)"
+	@echo "make outside   render the outside references that are missing, by stock Mitsuba (most of an hour of one core)"
 	@echo "make accuracy  the default beside all baselines on objects that nothing was chosen on (most of an hour)"
 	@echo "make curves    error against seconds of the light's estimators: docs/benchmarks/walk.svg (minutes)"
 	@echo "make picture   the README's picture, from the demo's run"
@@ -61,6 +62,9 @@ references: $(READY)
 	@for scene in $(REFERENCED); do \
 	  $(BIN)/disco-twin reference $$scene --out "$$(dirname $$scene)/references/$$(basename $$scene .toml)" || exit 1; \
 	done
+
+outside: $(READY)
+	$(BIN)/python -m benchmarks.volpath_references
 
 accuracy: $(READY)
 	$(BIN)/python -m benchmarks accuracy --json docs/benchmarks/accuracy.json

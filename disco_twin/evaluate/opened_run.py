@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -255,10 +256,12 @@ def _scores(kept: Mapping[str, Any], lasers: int) -> xr.Dataset:
     by_place = {tuple(row[key] for key in AXES.values()): row for row in relit}
 
     def table(figure: str) -> NDArray[np.float64]:
-        rows = [[[by_place[m, x, v][figure] for v in names["view"]] for x in names["light"]] for m in names["model"]]
-        return np.array(rows, np.float64)
+        rows = [by_place[place].get(figure) for place in itertools.product(*names.values())]
+        return np.array(rows, np.float64).reshape([len(axis) for axis in names.values()])
 
-    figures = (*scores.KEPT, *(f"rim_{figure}" for figure in scores.RIM))
+    outside = [f"volpath_{figure}" for figure in scores.OUTSIDE]
+    figures = [*scores.KEPT, *(f"rim_{figure}" for figure in scores.RIM)]
+    figures += [figure for figure in outside if any(figure in row for row in relit)]
     out: dict[str, Any] = {figure: (tuple(AXES), table(figure)) for figure in figures}
     decades = list(dict.fromkeys(d for own in reflectance.values() if own for d in own["coverage"]))
     parts = {"log10_rmse_measured": "measured", "log10_rmse_completed": "completed", "coverage": "coverage"}

@@ -15,7 +15,7 @@ import numpy as np
 from disco_twin.evaluate.columns import score_columns
 from disco_twin.evaluate.z_scores import ZScores, z_of_pixels
 from disco_twin.experiment.experiment import Experiment
-from disco_twin.experiment.references import reference_path
+from disco_twin.experiment.references import load_outside_reference, reference_path
 from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.light.references import LAYERS, load_reference
 from hw.base.arrays import F32, F64, Bool
@@ -32,6 +32,7 @@ log = logging.getLogger(__name__)
 FORMAT_VERSION = 2
 KEPT = ("nrmse", "nrmse_se", "nrmse_floor", "psnr", "energy_ratio")
 RIM = ("nrmse", "nrmse_se")
+OUTSIDE = ("nrmse", "nrmse_se")  # against the outside reference, kept as volpath_nrmse, volpath_nrmse_se
 
 
 class _Scores(Strict):
@@ -75,7 +76,8 @@ def score_images(
     image_of: Callable[[str, str, CameraConfig], F32],
 ) -> list[dict[str, Any]]:
     """Rows {light, view, method, nrmse, nrmse_se, nrmse_floor, psnr, energy_ratio, rim_nrmse, rim_nrmse_se}; what has
-    no score holds None. The rim's figures are of the object's pixels at its rim, all others of those without it.
+    no score holds None. The rim's figures are of the object's pixels at its rim, all others of those without it. Where
+    a light and view has an outside reference, its rows have volpath_nrmse and volpath_nrmse_se, against that one.
 
     image_of: method, light, view -> (L, H, W) relit image in W/(mm^2 sr)
     """
@@ -83,14 +85,19 @@ def score_images(
     for light in experiment.scene.relight.lights:
         for view in experiment.scene.relight.views:
             a, b = reference_halves(folder, light, view)
+            outside = outside_halves(experiment, folder, light, view)
             pixels = experiment.object_pixels(view)
             for method in methods:
                 image = image_of(method, light.name, view)
-                row = {"light": light.name, "view": view.name, "method": method}
-                what = " ".join(row.values())
+                what = f"{light.name} {view.name} {method}"
+                row: dict[str, Any] = {"light": light.name, "view": view.name, "method": method}
                 inner = usable_score(what, image, a, b, pixels.inner)
                 rim = usable_score(f"the rim of {what}", image, a, b, pixels.rim) if pixels.rim.any() else {}
-                rows.append(row | inner | {f"rim_{key}": rim.get(key) for key in RIM})
+                row |= inner | {f"rim_{key}": rim.get(key) for key in RIM}
+                if outside is not None:
+                    other = usable_score(f"{what} against volpath", image, outside[0], outside[1], pixels.inner)
+                    row |= {f"volpath_{key}": other[key] for key in OUTSIDE}
+                rows.append(row)
     return rows
 
 
@@ -132,6 +139,12 @@ def usable_score(what: str, image: F32, a: F32, b: F32, mask: Bool) -> dict[str,
 def reference_halves(folder: RunFolder, light: Light, view: CameraConfig) -> F32:
     """(2, L, H, W) both halves of a reference, W/(mm^2 sr): the light from below the surface, which R_d answers for."""
     return load_reference(reference_path(folder.twin / "references", light, view)).halves[:, LAYERS.index("subsurface")]
+
+
+def outside_halves(experiment: Experiment, folder: RunFolder, light: Light, view: CameraConfig) -> F32 | None:
+    """The same of the outside reference, if the scene has one of this light and view."""
+    found = load_outside_reference(folder.twin / "references", experiment.scene, light, view)
+    return None if found is None else found.halves[:, LAYERS.index("subsurface")]
 
 
 def load_relit(folder: RunFolder, method: str, light: str, view: CameraConfig) -> F32:

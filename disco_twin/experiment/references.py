@@ -1,4 +1,8 @@
-"""Reference images of a scene: their key, where they lie, and how those that are missing are rendered."""
+"""Reference images of a scene: their key, where they lie, and how those that are missing are rendered.
+
+An outside reference is the image of the same light and view by stock Mitsuba, in the same format, in a folder beside
+the ordinary ones. A few scenes ship some (benchmarks/volpath_references.py makes them); no run renders any.
+"""
 
 from __future__ import annotations
 
@@ -39,6 +43,43 @@ def shipped_references(scene_file: Path, name: str) -> Path:
     return scene_file.parent / "references" / name
 
 
+def outside_folder(folder: Path) -> Path:
+    """Where outside references lie in a folder of references: apart from those that scores stand on."""
+    return folder / "volpath"
+
+
+def holds_outside_reference(folder: Path, scene: Scene, light: Light, view: CameraConfig) -> bool:
+    """Whether a folder of references holds an outside one of this scene, light and view."""
+    return load_outside_reference(folder, scene, light, view) is not None
+
+
+def load_outside_reference(folder: Path, scene: Scene, light: Light, view: CameraConfig) -> Reference | None:
+    """The outside reference of a light and view in a folder of references; None where there is none, or one of another
+    scene, or (with a warning) a damaged one.
+    """
+    path = reference_path(outside_folder(folder), light, view)
+    if not path.is_file():
+        return None
+    try:
+        found = load_reference(path)
+    except InputError as error:
+        log.warning("%s", error.amended(remedy="delete it, or take it again from where the scene came from"))
+        return None
+    return found if found.key == reference_key(scene, light, view) else None
+
+
+def keep_outside_references(scene: Scene, shipped: Path, own: Path) -> None:
+    """Copy the shipped outside references of a scene into its own folder of references."""
+    if shipped.resolve() == own.resolve():
+        return
+    for light in scene.relight.lights:
+        for view in scene.relight.views:
+            if holds_outside_reference(shipped, scene, light, view):
+                source, target = (reference_path(outside_folder(f), light, view) for f in (shipped, own))
+                target.parent.mkdir(parents=True, exist_ok=True)
+                write_atomically(target, source.read_bytes())
+
+
 def holds_reference(folder: Path, experiment: Experiment, light: Light, view: CameraConfig) -> bool:
     """Whether a folder holds this scene's reference of a light and view, with as little noise as it asks for."""
     path = reference_path(folder, light, view)
@@ -54,7 +95,8 @@ def holds_reference(folder: Path, experiment: Experiment, light: Light, view: Ca
 
 
 def render_references(experiment: Experiment, shipped: Path, own: Path, progress: Progress) -> int:
-    """Make sure that every reference lies in `own`: taken from `shipped`, kept from before, or rendered now.
+    """Make sure that every reference lies in `own`: taken from `shipped`, kept from before, or rendered now. Outside
+    references are taken from `shipped` where there are some.
 
     Returns how many lights had to be rendered. Raises: InputError where `own` is no folder.
     """
@@ -63,6 +105,7 @@ def render_references(experiment: Experiment, shipped: Path, own: Path, progress
     if own.exists() and not own.is_dir():
         raise InputError("is not a folder", file=own, remedy="choose another --out")
     own.mkdir(parents=True, exist_ok=True)
+    keep_outside_references(scene, shipped, own)
     for done, light in enumerate(lights):
         progress(done, len(lights))
         missing = [view for view in scene.relight.views if not holds_reference(own, experiment, light, view)]

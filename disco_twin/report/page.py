@@ -77,6 +77,7 @@ def render(data: ReportData) -> str:
         summary=data.summary,
         figures=figures,
         methods=methods,
+        outside=any("volpath_nrmse" in row for row in relit),
         broad=pooled([row for row in relit if row["light"] in BROAD], data.main),
         light_rows=[light_row(relit, light, methods, data.main) for light in dict.fromkeys(r["light"] for r in relit)],
         pareto={m: (data.seconds[m], e) for m, e in errors.items() if m in data.seconds and e > 0},
@@ -94,6 +95,7 @@ def light_row(relit: Sequence[Summary], light: str, methods: Sequence[str], main
         "errors": errors,
         "best": min((e for e in errors if np.isfinite(e)), default=None),
         "rim": pooled(relit, main, light, "rim_nrmse"),
+        "outside": pooled(relit, main, light, "volpath_nrmse"),
         "energy": [row["energy_ratio"] for row in own],
         "noise": rms([row["nrmse_floor"] for row in own if row["nrmse_floor"] is not None]),
     }

@@ -15,7 +15,7 @@ from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.keys import code_key, content_key, identity
 from disco_twin.experiment.omissions import left_out_by_the_twin
 from disco_twin.experiment.pipeline_process import load_results, pipeline_inputs, reconstruct_apart, stale
-from disco_twin.experiment.references import reference_key, render_references, shipped_references
+from disco_twin.experiment.references import outside_folder, reference_key, render_references, shipped_references
 from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.run.progress import Report, run_log, stage_bar
 from disco_twin.scene.scene import Profile, Scene, load_scene
@@ -42,7 +42,7 @@ CODE = {  # where the code of a stage begins: all that it imports is part of the
 }
 CAPTURE = ("capture/images.bin", "capture/journal.bin", "capture/plan.json")
 TARGETS = ("capture/calibration/*/*", "capture/calibration/*/bracket/*")
-REFERENCES = ("twin/references/*.exr",)
+REFERENCES = ("twin/references/*.exr", "twin/references/volpath/*.exr")
 OUTPUTS = {  # files that a finished stage leaves, as patterns in the run folder
     "scan": ("capture/scan.ply", "capture/rig.json", "capture/sensor.json"),
     "targets": TARGETS,
@@ -184,7 +184,9 @@ def truth_stages(run: Run) -> None:
     keys = [reference_key(scene, light, view) for light in scene.relight.lights for view in scene.relight.views]
     shipped = shipped_references(run.scene_file, scene.name)
     render = partial(render_references, experiment, shipped, folder.twin / "references")
-    run.stage("references", run.key("references", keys, scene.simulation.reference_noise), render, "lights")
+    outside = sorted(outside_folder(shipped).glob("*.exr"))
+    key = run.key("references", keys, scene.simulation.reference_noise, outside)
+    run.stage("references", key, render, "lights")
 
 
 def pipeline_key(run: Run, methods: Sequence[str]) -> str:

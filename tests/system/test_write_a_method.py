@@ -17,7 +17,9 @@ from frozen_run import NOISE, VIEWS, write_frozen_run
 import disco_twin
 from disco_twin.evaluate.opened_run import OpenedRun
 from disco_twin.evaluate.scores import score_images
+from disco_twin.experiment.references import outside_folder, reference_key, reference_path
 from disco_twin.experiment.run_folder import RunFolder
+from disco_twin.light.references import Reference, load_reference, save_reference
 from hw.base.errors import InputError
 from pipeline.geometry.fresnel import Boundary
 from pipeline.geometry.nominal_rig import CameraConfig
@@ -133,6 +135,31 @@ def test_an_error_at_the_rim_is_the_rim_s_alone(run: OpenedRun) -> None:
     for row in scored(1.0, 1.5):
         assert row["nrmse"] == pytest.approx(0.5, rel=0.02)
         assert abs(row["rim_nrmse"]) < NOISE
+
+
+def test_an_outside_reference_is_scored_beside_the_ordinary_one(run: OpenedRun) -> None:
+    """Rationale: one light and view has an outside reference, ten per cent brighter than the ordinary one, whose noise
+    it shares; then it is gone, and nothing tells of it.
+    """
+    light, view, folder = run.scene.relight.lights[0], run.scene.relight.views[1], run.folder.twin / "references"
+    halves, key = load_reference(reference_path(folder, light, view)).halves, reference_key(run.scene, light, view)
+    path = reference_path(outside_folder(folder), light, view)
+    model = run.models["flat"]
+    assert "volpath_nrmse" not in run.score(model)
+    save_reference(path, Reference(np.float32(1.1) * halves, 0.03, key))
+    scores = run.score(model).isel(model=0)
+    assert int(scores.volpath_nrmse.count()) == int(scores.volpath_nrmse_se.count()) == 1
+    place = {"light": light.name, "view": view.name}
+    ordinary, outside = (float(scores[name].sel(place)) for name in ("nrmse", "volpath_nrmse"))
+    image = run.relight(model).sel(place).values[:, : view.height, : view.width]
+    a, b = halves[:, 0].astype(float)
+    inner = run.experiment.object_pixels(view).inner
+    a, b, image = a[:, inner], b[:, inner], image[:, inner]
+    wanted = (((image - 1.1 * a) * (image - 1.1 * b)).sum() / (1.21 * a * b).sum()) ** 0.5
+    assert outside == pytest.approx(wanted, rel=1e-3)  # half floats
+    assert abs(outside - ordinary) > 0.01
+    path.unlink()
+    assert "volpath_nrmse" not in run.score(model)
 
 
 def test_images_are_read_at_random(run: OpenedRun) -> None:

@@ -42,6 +42,21 @@ def test_the_page_is_self_contained_and_complete(tmp_path: Path) -> None:
     assert len(page) < 12e6
 
 
+def test_errors_against_outside_references_are_shown_where_there_are_some() -> None:
+    data = replace(fake_data(), impulses=(), comparisons=(), distance=None)
+    assert "volpath" not in render(data)
+    light = LIGHTS[0]
+    outside = {"volpath_nrmse": 0.123, "volpath_nrmse_se": 0.004}
+    rows = [row | (outside if row["light"] == light else {}) for row in data.summary["relit"]]
+    page = render(replace(data, summary={**data.summary, "relit": rows}))
+    table = page.split("<h2>Errors</h2>")[1].split("</table>")[0]
+    assert "<th>volpath, default</th>" in table
+    lines = {row.split("</td>")[0].removeprefix("<td>"): row for row in table.replace("\n", "").split("<tr>")}
+    assert lines[light].count("<td>0.123</td></tr>") == 1
+    assert all(lines[other].endswith("<td>-</td></tr>") for other in LIGHTS if other != light)
+    assert "<th>volpath_nrmse_se</th>" in page
+
+
 def test_a_run_with_little_to_show_still_gets_its_page() -> None:
     data = fake_data()
     summary = {**data.summary, "relit": [], "left_out": []}
