@@ -31,6 +31,8 @@ $(READY): pyproject.toml
 
 # Other people's programs, for outside checks; where one cannot be had, its test is skipped.
 CLIENTS := $(VENV)/.clients
+.PHONY: clients
+clients: $(CLIENTS)
 $(CLIENTS): $(READY)
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[clients]'
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[luxx]'
@@ -40,12 +42,16 @@ $(CLIENTS): $(READY)
 demo: $(READY)
 	$(BIN)/disco-twin run scenes/quick.toml --out $(OUT)
 
-# The laser's timing alone, then all else on every core; each worker's linear algebra keeps to one of them. One worker
-# more than cores leaves emulated devices too late for their drivers.
+# The laser's timing alone. Then what waits for devices, in a process of its own that gets a core whenever it wants one,
+# beside what computes, on every core; each worker's linear algebra keeps to one of them.
+DEVICE_LOG := $(VENV)/devices.log
 test: $(CLIENTS)
 	@status=0; \
 	$(BIN)/python -m pytest -m timing || status=1; \
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not slow and not timing" || status=1; \
+	$(BIN)/python -m pytest -m "device and not (slow or timing)" >$(DEVICE_LOG) 2>&1 & devices=$$!; \
+	OMP_NUM_THREADS=1 nice -n 10 $(BIN)/python -m pytest -n auto -m "not (device or slow or timing)" || status=1; \
+	wait $$devices || status=1; \
+	echo "tests of devices, which ran at the same time:"; cat $(DEVICE_LOG); \
 	exit $$status
 
 lint: $(READY)

@@ -1,4 +1,4 @@
-"""What all tests share: no display, the repository's paths, the order in which files are given to several workers."""
+"""What all tests share: no display, the repository's paths, which tests are of devices, which files come first."""
 
 from __future__ import annotations
 
@@ -23,13 +23,18 @@ hypothesis.settings.load_profile("disco-twin")
 
 
 LONGEST_FIRST = ("regression", "validation", "system")  # folders of tests; nobody waits at the end for one long file
+DEVICES = ("unit/hw", "unit/disco_twin/emulation", "system/test_rig.py")  # tests that wait for devices in real time
 
 
+@pytest.hookimpl(tryfirst=True)  # before `-m` chooses by marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the files that take longest first."""
+    """Mark the tests of devices; put the files that take longest first."""
     here = Path(__file__).parent
     places = {name: k for k, name in enumerate(LONGEST_FIRST)}
     items.sort(key=lambda item: places.get(item.path.relative_to(here).parts[0], len(places)))
+    for item in items:
+        if any(item.path.is_relative_to(here / place) for place in DEVICES):
+            item.add_marker("device")
 
 
 @pytest.fixture(scope="session")
