@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 import pytest
+from scene_texts import GOOD
 
 from disco_twin.cli.app import main
 from disco_twin.run import stages as run_module
@@ -24,30 +25,27 @@ def status_and_line(arguments: list[str], capsys: pytest.CaptureFixture[str]) ->
     return code, lines[0]
 
 
-def edited(repository: Path, folder: Path, old: str, new: str) -> Path:
-    text = (repository / "scenes" / "quick.toml").read_text()
-    assert old in text
+def edited(folder: Path, old: str = "", new: str = "") -> Path:
+    """The file of a scene that is in order, and quickly built, but for one change."""
+    assert old in GOOD
     path = folder / "scene.toml"
-    path.write_text(text.replace(old, new, 1))
+    path.write_text(GOOD.replace(old, new, 1))
     return path
 
 
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ('name = "quick"', 'name = "quick', "not valid TOML"),
-        ('name = "quick"', 'name = "quick"\nsede = 3', "seed"),
-        ("spots = 300", "spots = 0", "rig.spots"),
-        ("position_mm = [390.0, -120.0, 190.0]", "position_mm = [390.0, -120.0, 190.0]\naim_mm = [900.0, 0.0, 0.0]",
-         "does not see the object"),
-        ("[rig.projector]", "[rig.projector]\naim_mm = [600.0, 900.0, 0.0]", "never hits the object"),
-        ("size_mm = [40.0", "size_mm = [-40.0", "size_mm"),
+        ('name = "good"', 'name = "good', "not valid TOML"),
+        ('name = "good"', 'name = "good"\nsede = 3', "seed"),
+        ("[scan]", "[rig]\nspots = 0\n[scan]", "rig.spots"),
+        ("width = 192", "aim_mm = [900.0, 0.0, 0.0]\nwidth = 192", "does not see the object"),
+        ("[scan]", "[rig.projector]\naim_mm = [600.0, 900.0, 0.0]\n[scan]", "never hits the object"),
+        ("radius_mm = 3.0", "radius_mm = -3.0", "radius_mm"),
     ],
-)  # fmt: skip
-def test_bad_scenes(
-    old: str, new: str, said: str, repository: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scene = edited(repository, tmp_path, old, new)
+)
+def test_bad_scenes(old: str, new: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = edited(tmp_path, old, new)
     status, line = status_and_line(["run", str(scene), "--out", str(tmp_path / "out")], capsys)
     assert status == 2
     assert said in line
@@ -93,7 +91,6 @@ def test_what_goes_wrong_later(
     error: BaseException,
     status: int,
     said: str,
-    repository: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -102,8 +99,7 @@ def test_what_goes_wrong_later(
         raise error
 
     monkeypatch.setattr("disco_twin.run.scan.write_scan", fail)
-    quick = str(repository / "scenes" / "quick.toml")
-    found, line = status_and_line(["run", quick, "--out", str(tmp_path / "out"), "--profile", "small"], capsys)
+    found, line = status_and_line(["run", str(edited(tmp_path)), "--out", str(tmp_path / "out")], capsys)
     assert found == status
     assert said in line
 

@@ -183,9 +183,7 @@ def readable(folder: Path) -> list[int]:
                 assert str(PLAN.address(i)) in str(image)
             else:
                 assert same(image, frame(SHAPE, i))
-        damaged = [i for i, image in enumerate(images) if isinstance(image, CorruptImage)]
-        assert damaged_images(stream) == damaged
-        return [i for i in range(len(images)) if i not in damaged]
+        return [i for i, image in enumerate(images) if not isinstance(image, CorruptImage)]
 
 
 @pytest.mark.parametrize("name", [files.IMAGES, files.JOURNAL])
