@@ -17,7 +17,6 @@ from pipeline.calibrate.intrinsics import Intrinsics, board_pose, find_corners, 
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.plan.targets import make_targets
 
-
 SEED = 3
 
 
