@@ -16,7 +16,7 @@ from pipeline.geometry.camera import PinholeCamera
 NEWTON_STEPS = 8  # of the lens's inverse, for distortions that cover the picture (`covers_image`)
 
 
-def object_pixels(camera: PinholeCamera, vertices: F64, faces: I64) -> I64:
+def candidate_pixels(camera: PinholeCamera, vertices: F64, faces: I64) -> I64:
     """(N,) numbers (row * width + column) of all pixels that any ray to the object falls into, and a few around them.
 
     The boxes of the projected triangles, which hold them whole; a pixel more on every side where the lens bends lines.

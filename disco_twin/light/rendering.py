@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from disco_twin.light.importance import Views
-from disco_twin.light.pixels import PixelSource, object_pixels
+from disco_twin.light.pixels import PixelSource, candidate_pixels
 from disco_twin.light.references import HALVES, LAYERS, noise_of
 from disco_twin.light.sampling import Rng
 from disco_twin.light.sources import light_source, sky_source
@@ -126,7 +126,7 @@ def _sky_image(
     transport: Transport, light: Sky, camera: PinholeCamera, walks: int, seed: int, run: int, shine: bool = False
 ) -> F32:
     """(2, 2, L, H, W) from walks that start at the pixels; those that cannot see the object are black."""
-    pixels = object_pixels(camera, transport.vertices, transport.faces)
+    pixels = candidate_pixels(camera, transport.vertices, transport.faces)
     image = np.zeros((len(HALVES), len(LAYERS), transport.lasers, camera.height * camera.width), np.float32)
     if shine and transport.object.boundary.kind == "matched":
         return image.reshape(*image.shape[:-1], camera.height, camera.width)

@@ -21,7 +21,7 @@ from twins import camera
 
 from disco_twin.light import rendering
 from disco_twin.light.importance import Diffusion, Views, view_targets
-from disco_twin.light.pixels import object_pixels
+from disco_twin.light.pixels import candidate_pixels
 from disco_twin.light.references import noise_of
 from disco_twin.light.rendering import from_light, from_pixels, towards_views
 from disco_twin.light.sources import light_source
@@ -138,7 +138,7 @@ def test_no_pixel_of_the_object_is_left_out() -> None:
     transport = Transport(obj, cells=64)
     seen = plain(transport, LIGHTS["directional"], views, 20_000).sum(axis=(0, 2))
     for view, image in zip(views, seen, strict=True):
-        pixels = object_pixels(view, transport.vertices, transport.faces)
+        pixels = candidate_pixels(view, transport.vertices, transport.faces)
         assert set(np.flatnonzero(image)) <= set(pixels)
         assert len(pixels) < 1.5 * np.count_nonzero(image)
 
