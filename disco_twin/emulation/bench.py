@@ -37,6 +37,8 @@ class Bench:
     changes, anything is moved, a laser starts or its port is given back: two gates at once; a gate open while mirrors
     or turntable move; a laser that starts, or shines, without the warning lamp, or starts behind an open gate; a laser
     that emits though nobody holds its port.
+
+    Raises: InputError for more mirror steps than the board has.
     """
 
     def __init__(self, twin: TwinRig, clock: Clock) -> None:

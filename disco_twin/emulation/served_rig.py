@@ -25,11 +25,11 @@ class Darkness:
         """Nothing to do."""
 
     def image(self, camera: int, aim: Aim, laser: int) -> F32:
-        """Refused: nothing looks."""
+        """Nothing looks. Raises: DiscoError."""
         raise DiscoError("these emulated devices have no camera")
 
     def silhouette(self, camera: int, angle: int) -> F32:
-        """Refused: nothing looks."""
+        """Nothing looks. Raises: DiscoError."""
         raise DiscoError("these emulated devices have no camera")
 
 

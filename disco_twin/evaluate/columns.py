@@ -34,6 +34,8 @@ def score_columns(
         `unlit` ones (`TotalsScore`); a method whose model states none is left out.
     neck: `score_neck` of all that state what leaves; None where the scene has no neck
     z: by method, of `entries` by decade and of `totals` (`ZScores`); a method that states no variance is left out.
+
+    Raises: InputError where the truth or the samples cannot be read.
     """
     truth = Truth.load(folder.twin / "truth.npz")
     lit = lit_vertices(load_samples(folder.work / "samples.npz"))[truth.columns]

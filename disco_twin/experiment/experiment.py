@@ -32,17 +32,17 @@ class Experiment:
 
     @cached_property
     def object(self) -> TwinObject:
-        """The object that light is traced through."""
+        """The object that light is traced through. Raises: InputError as `build_object`."""
         return build_object(self.scene)
 
     @cached_property
     def scan(self) -> trimesh.Trimesh:
-        """The mesh that the pipeline is given."""
+        """The mesh that the pipeline is given. Raises: InputError as `build_scan`."""
         return build_scan(self.scene, self.object.mesh)
 
     @cached_property
     def plan(self) -> Plan:
-        """Which images the capture consists of."""
+        """Which images the capture consists of. Raises: InputError as `make_plan`."""
         return make_plan(self.scene.rig, self.scan)
 
     @cached_property

@@ -22,7 +22,10 @@ COLUMNS_AT_ONCE = 4  # between two reports of the progress
 
 
 def true_exitance(experiment: Experiment, columns: Sequence[int] | I64, walks: int) -> Truth:
-    """The truth from these scan vertices to all others, from `walks` photons a column. Needs the renderer."""
+    """The truth from these scan vertices to all others, from `walks` photons a column. Needs the renderer.
+
+    Raises: InputError as `hat_basis`.
+    """
     basis = hat_basis(experiment.object.mesh, experiment.scan)
     return truth_columns(experiment.transport, basis, np.asarray(columns, np.int64), walks, experiment.seed("truth"))
 

@@ -41,6 +41,8 @@ def reconstruct_apart(
 
     calibration: a file to use instead of what the pipeline would calibrate itself.
     The process reports its peak itself: `wait4` would count what our process held when it started the child.
+
+    Raises: PipelineFailed with the process's own last line.
     """
     request = folder.work / REQUEST
     write_json(request, pipeline_inputs(scene, methods))
@@ -74,7 +76,10 @@ def load_results(folder: RunFolder) -> PipelineRecord:
 
 
 def stale(scene: Scene, folder: RunFolder, methods: Sequence[str]) -> str | None:
-    """Why the latest reconstruction is not what these methods of this scene would be scored by; None if it is."""
+    """Why the latest reconstruction is not what these methods of this scene would be scored by; None if it is.
+
+    Raises: InputError where the records of the latest one cannot be read.
+    """
     made = load_results(folder).methods
     missing = [method for method in methods if method not in made]
     if missing:

@@ -153,7 +153,7 @@ class RunFolder:
             self._save()
 
     def alone(self) -> AbstractContextManager[None]:
-        """No other process works in the folder meanwhile."""
+        """No other process works in the folder meanwhile. Raises: DiscoError where one does."""
         problem = f"{self.root}: another process works in this folder"
         return alone_in(self.root, DiscoError(f"{problem}. Remedy: wait for it, or choose another --out"))
 

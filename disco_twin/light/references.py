@@ -46,7 +46,7 @@ def noise_of(halves: F32) -> float:
 
 def save_reference(path: Path, reference: Reference) -> None:
     """Replace one EXR of half floats, channels `<layer>.<half>.<laser>`, scaled so that the brightest value is 6e4:
-    half floats then resolve light that is ten decades fainter.
+    half floats then resolve light that is ten decades fainter. Raises: OSError where the disk refuses.
     """
     import OpenEXR
 

@@ -112,6 +112,7 @@ def hat_basis(fine: trimesh.Trimesh, scan: trimesh.Trimesh) -> scipy.sparse.csr_
     """(V_fine, V_scan) values of the scan's hat functions at the fine vertices' closest points on the scan.
 
     Rows are barycentric weights: not negative, sum 1. The identity where both meshes are the same.
+    Raises: InputError where a hat function holds no fine vertex.
     """
     if fine.vertices.shape == scan.vertices.shape and np.array_equal(fine.vertices, scan.vertices):
         return scipy.sparse.identity(len(fine.vertices), format="csr")

@@ -25,7 +25,7 @@ SPOTS_SHOWN = 4
 
 
 def collect(experiment: Experiment, folder: RunFolder, summary: dict[str, Any]) -> ReportData:
-    """Read what the report shows."""
+    """Read what the report shows. Raises: InputError where a file of the run is missing or damaged."""
     scene = experiment.scene
     methods = list(dict.fromkeys(row["method"] for row in summary["relit"]))
     truth = Truth.load(folder.twin / "truth.npz")
@@ -101,7 +101,10 @@ def impulses(rig: RigConfig, capture: Path, sensor: Sensor) -> tuple[list[list[I
 def comparisons(
     experiment: Experiment, folder: RunFolder, methods: Sequence[str], relit: Sequence[dict[str, Any]]
 ) -> list[Comparison]:
-    """Relit images beside the reference (its subsurface layer, both halves together) for every light and view."""
+    """Relit images beside the reference (its subsurface layer, both halves together) for every light and view.
+
+    Raises: InputError where an image is missing or damaged.
+    """
     out = []
     masks = {view.name: experiment.object_pixels(view).mask for view in experiment.scene.relight.views}
     for light in experiment.scene.relight.lights:

@@ -69,7 +69,10 @@ def _has_images(folder: Path) -> bool:
 
 
 def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool) -> None:
-    """Scan and capture; continues where it was interrupted, if the rig is the same and has not moved since."""
+    """Scan and capture; continues where it was interrupted, if the rig is the same and has not moved since.
+
+    Raises: InputError for a rig file, a folder or a scan that does not serve; what the devices raise.
+    """
     file, experiment, folder = open_rig_file(run, path, armed), run.experiment, run.folder
     for warning in experiment.warnings:
         log.warning("%s", warning)

@@ -75,7 +75,10 @@ class Run:
         return self.experiment.scene
 
     def key(self, stage: str, *inputs: Any) -> str:
-        """Key of a stage: what the scene states of rig and object, the stage's code, its other inputs."""
+        """Key of a stage: what the scene states of rig and object, the stage's code, its other inputs.
+
+        Raises: InputError as `code_key`.
+        """
         return content_key(self.folder.identity, code_key(*CODE[stage]), *inputs)
 
     def stage(self, name: str, key: str, work: Callable[[Report], Any], unit: str = "") -> None:
@@ -200,7 +203,10 @@ def pipeline_key(run: Run, methods: Sequence[str]) -> str:
 
 
 def pipeline_stage(run: Run) -> None:
-    """Reconstruct and relight, in a process of its own that is given the capture and nothing of the truth."""
+    """Reconstruct and relight, in a process of its own that is given the capture and nothing of the truth.
+
+    Raises: PipelineFailed with its last line, and what `Run.stage` raises.
+    """
     key = pipeline_key(run, run.methods)
     run.stage("pipeline", key, lambda _: reconstruct_apart(run.scene, run.folder, run.methods))
     for warning in load_results(run.folder).warnings:
@@ -259,7 +265,7 @@ def stage_rows(folder: RunFolder, parts: Sequence[StageFigures]) -> list[dict[st
 
 
 def run_all(run: Run) -> dict[str, Any]:
-    """Everything, from the scan to the report."""
+    """Everything, from the scan to the report. Raises: what the stages raise."""
     with run_log(run.folder.root / "run.log", run.console):
         capture_stages(run)
         truth_stages(run)

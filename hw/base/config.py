@@ -77,7 +77,7 @@ NearbyFile = Annotated[Path, Field(strict=False), AfterValidator(_resolve)]
 def load_toml(
     path: str | Path, schema: type[M], what: str = "a scene's TOML file", others: Mapping[str, str] | None = None
 ) -> M:
-    """Read and validate a TOML file. Every failure is one `InputError` that names the first problem.
+    """Read and validate a TOML file. Raises: InputError for every failure; it names the first problem.
 
     what: the kind of file, in words for the remedy where another one was given; others: a table of another kind of
     file, and what that file is called
@@ -132,7 +132,7 @@ def _numbers(data: Any, key: str = "") -> Iterator[tuple[str, int]]:
 
 
 def read_json(path: Path, schema: type[T], remedy: str) -> T:
-    """Read and validate a JSON file that a program wrote; any failure, another format version too, is one line."""
+    """Read and validate a JSON file that a program wrote. Raises: InputError for any failure or another version."""
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         return TypeAdapter(schema).validate_python(data)

@@ -49,7 +49,7 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file as a whole (see `replacing`)."""
+    """Replace a file as a whole. Raises: OSError as `replacing`."""
     with replacing(path) as file:
         file.write(content)
 
@@ -60,7 +60,10 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def save_arrays(path: Path, version: int, arrays: Mapping[str, NDArray[Any]], **head: Any) -> None:
-    """Replace an .npz as a whole: arrays, and a head of whatever JSON holds, with `format_version`. No pickle."""
+    """Replace an .npz as a whole: arrays, and a head of whatever JSON holds, with `format_version`. No pickle.
+
+    Raises: OSError as `replacing`.
+    """
     with replacing(path) as file:
         everything = {"head": np.array(json.dumps({"format_version": version} | head)), **arrays}
         np.savez(file, **everything)  # type: ignore[arg-type]  # the stubs fear an array named allow_pickle

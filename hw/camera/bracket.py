@@ -26,6 +26,8 @@ class Bracket:
     """The exposures of one image and what the sensor's digital numbers mean.
 
     exponents: halvings of the longest exposure, ascending from 0; saturation_dn: from here on the sensor is not linear
+
+    Raises: InputError for exposures or a saturation that no sensor of so many bits has.
     """
 
     longest_exposure_s: float

@@ -34,6 +34,8 @@ class ByteLog:
     """Appends to a file, line by line, flushed: it is complete up to the moment of a crash.
 
     A log that cannot be written any more (a full disk) ends with one warning: the device goes on without it.
+
+    Raises: InputError where the file cannot be begun.
     """
 
     def __init__(self, path: Path) -> None:

@@ -87,7 +87,7 @@ def measure_poses(
     cameras: Sequence[CameraImages],
     angles: Sequence[float],
 ) -> PoseFit:
-    """From the silhouette image of every view."""
+    """From the silhouette image of every view. Raises: DiscoError as `fit_poses`, CorruptImage."""
     images = []
     for view in range(stream.plan.views):
         raw = stream.read(ImageAddress(view, "silhouette"))
@@ -144,7 +144,7 @@ def measure_projector(
 ) -> ProjectorFit:
     """From the spots on the object, in the object frame at the first angle. All cameras' sightings count.
 
-    nominal: in that frame, place_error: (6, 6) covariance of its pose
+    nominal: in that frame, place_error: (6, 6) covariance of its pose. Raises: DiscoError where no camera sees any.
     """
     plan, surface = stream.plan, RayMesh.of(mesh)
     found = find_peaks(stream, sensor, plan.lasers // 2)

@@ -187,7 +187,7 @@ def refine(
 
     start: the nominal projector, points: (N, 3) mm, all in one frame; normals, to_eye: (N, 3) unit; group: (N,) spots
     of one group err together (default: each for itself); place: (6, 6) covariance of the nominal pose (default: of a
-    projector set up in the points' own frame)
+    projector set up in the points' own frame). Raises: DiscoError as `minimise`.
     """
     nominal = start.full_angle_rad
     known = StepSize(nominal, np.diag((nominal * ANGLE_SHARE) ** 2)) if size is None else size

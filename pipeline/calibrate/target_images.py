@@ -42,7 +42,10 @@ def has_targets(capture: Path, rig: RigConfig) -> bool:
 
 
 def measure_response(capture: Path, rig: RigConfig, sensor: Sensor) -> Response:
-    """From every camera's bracket of a board; the cameras are of one make and share one response."""
+    """From every camera's bracket of a board; the cameras are of one make and share one response.
+
+    Raises: InputError where the brackets differ, or do not tell a response.
+    """
     images: list[list[U16]] = []
     for camera in rig.cameras:
         with StreamReader(capture / FOLDER / camera.name / BRACKET) as stream:

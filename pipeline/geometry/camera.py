@@ -70,7 +70,7 @@ class PinholeCamera:
 
     @classmethod
     def from_config(cls, config: CameraConfig) -> PinholeCamera:
-        """The nominal camera in the world frame."""
+        """The nominal camera in the world frame. Raises: InputError where it aims at its own place."""
         focal = config.focal_length_mm / (config.pixel_pitch_um * 1e-3)
         return cls(
             config.width,

@@ -28,7 +28,7 @@ class TwoMirrorProjector:
 
     @classmethod
     def from_config(cls, config: ProjectorConfig) -> TwoMirrorProjector:
-        """The nominal projector in the world frame."""
+        """The nominal projector in the world frame. Raises: InputError where it aims at its own place."""
         angle = np.deg2rad(config.full_angle_deg)
         pose = look_at(config.position_mm, config.aim_mm, config.up)
         return cls(config.steps, np.array([angle, angle]), config.separation_mm, pose)

@@ -68,6 +68,8 @@ def score_relit(image: ArrayLike, half_a: ArrayLike, half_b: ArrayLike, mask: Bo
     The standard error uses the symmetry under exchange of A and B. With m the model minus the mean M of both and
     r = nrmse2, the sum over a block of (m + r M)(A - B) has mean zero and, for equal Gaussian noise, exactly the
     variance of the block's part of the numerator minus r times the denominator, correlations inside included.
+
+    Raises: Unscorable where the mask or the reference leaves nothing to compare with.
     """
     i, a, b = (np.asarray(x, np.float64)[:, mask] for x in (image, half_a, half_b))
     if i.size == 0:
