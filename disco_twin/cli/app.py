@@ -183,7 +183,7 @@ def budget(
 ) -> None:
     """Show where a run's relighting error comes from: each part made exact in turn. Renders; minutes, kept in OUT."""
     from disco_twin.cli.tables import budget_tables
-    from disco_twin.run.budget import make_budget
+    from disco_twin.run.budget.make import make_budget
     from disco_twin.run.progress import run_log
     from disco_twin.run.stages import reopen_run
 

@@ -12,7 +12,7 @@ from disco_twin.evaluate.summary import figure_or_dash, pooled
 from pipeline.capture.quality import ViewQuality
 
 if TYPE_CHECKING:
-    from disco_twin.run.budget import Budget
+    from disco_twin.run.budget.rows import Budget
 
 QUALITY = ("view", "camera", "deg", "images", "saturated", "lit", "range", "dark", "mW")
 
@@ -28,7 +28,7 @@ def score_table(summary: dict[str, Any], methods: Sequence[str]) -> Table:
 
 def budget_tables(budget: Budget) -> tuple[Table, Table]:
     """nrmse of every row, views together, and what each part costs, by light."""
-    from disco_twin.run.budget import COSTS, LEFT
+    from disco_twin.run.budget.rows import COSTS, LEFT
 
     lights = list(dict.fromkeys(row.light for row in budget.rows))
     made, costs = (_table((name, *lights), name) for name in ("nrmse with", "what costs"))

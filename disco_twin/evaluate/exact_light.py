@@ -19,31 +19,27 @@ from scipy.sparse import linalg as sparse_linalg
 
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.object.mesh import hat_basis
-from hw.base.arrays import F64
+from hw.base.arrays import F64, I64
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.geometry.fresnel import Boundary, mean_transmittance, transmittance
+from pipeline.geometry.fresnel import Boundary, mean_transmittance
 from pipeline.geometry.mesh import RayMesh
-from pipeline.geometry.pixel_footprints import trace_pixels
-from pipeline.reconstruct.global_term.boundary_fit import EDGES
+from pipeline.reconstruct.global_term.boundary_fit import SeenRadiosity, ratio_by_cosine
 from pipeline.reconstruct.samples.spots import Spots
 from pipeline.relight.irradiance import hat_moments
 from pipeline.relight.lights import Light
 
-SUPERSAMPLE = 3
 SAMPLE_WALKS, REPLICATES = 30_000, 4  # of a spot's exact samples; those whose spread is their noise
 SPOTS_AT_ONCE = 25
 NEGLIGIBLE = 1e-6  # of a pattern's power
 
 
 @dataclass(frozen=True)
-class SeenRadiosity:
-    """A reference and the radiosity that should explain it. camera; reference: (L, H, W) W/(mm^2 sr), mean of both
-    halves; radiosity: (L, V) W/mm^2 on the mesh's vertices
-    """
+class _Pattern:
+    """Light of one sign over the object. hat: (V_fine,) shape; lasers: (n,) that have it; watts: (n,) signed power."""
 
-    camera: PinholeCamera
-    reference: F64
-    radiosity: F64
+    hat: F64
+    lasers: I64
+    watts: F64
 
 
 class ExactLight:
@@ -73,10 +69,9 @@ class ExactLight:
         lasers = self.experiment.transport.lasers
         return hat_moments(light, self.mesh, self.eta, lasers) / (self.areas * self.mean)
 
-    def entering_on_hats(self, light: Light, boundary: Boundary) -> F64:
+    def entering_on_hats(self, light: Light) -> F64:
         """As `entering`, as a model on the scan knows it: projected onto the scan's hat functions."""
-        lasers = self.experiment.transport.lasers
-        moments = hat_moments(light, self.scan, boundary, lasers)
+        moments = hat_moments(light, self.scan, self.eta, self.experiment.transport.lasers)
         density = _solved(RayMesh.of(self.scan).mass_matrix, moments) / self.mean
         return np.asarray((self.basis @ density.T).T)
 
@@ -90,39 +85,25 @@ class ExactLight:
         transport, lasers = self.experiment.transport, len(density)
         from disco_twin.light.sources import HatSource
 
-        share = density / np.maximum(np.abs(density).max(axis=1, keepdims=True), 1e-300)
-        rows = [0] if np.allclose(share, share[:1], rtol=1e-3, atol=1e-6) else list(range(lasers))
-        factor = np.abs(density).max(axis=1) / np.maximum(np.abs(density[rows]).max(axis=1), 1e-300)
-        hats, row_of, watts = [], [], []
-        for row in rows:
-            whole = float(np.abs(density[row]) @ self.areas)
-            for sign in (1.0, -1.0):
-                part = np.maximum(sign * density[row], 0.0)
-                power = float(part @ self.areas)
-                if power > NEGLIGIBLE * whole:
-                    hats.append(part)
-                    row_of.append(row)
-                    watts.append(sign * power)
-        n = len(hats)
         shape = (2, len(cameras), lasers, cameras[0].height, cameras[0].width) if cameras else None
-        images, power_out = None if shape is None else np.zeros(shape), np.zeros((2, lasers, len(self.areas)))
-        if not n:  # black light
-            return images, power_out
-        stacked = np.stack([*hats, *hats])
+        images, power = None if shape is None else np.zeros(shape), np.zeros((2, lasers, len(self.areas)))
+        patterns = _patterns(density, self.areas)
+        if not patterns:  # black light
+            return images, power
+        hats = np.stack([pattern.hat for pattern in patterns] * 2)  # the first half's, then the second's
         traced = transport.trace(
-            lambda group: HatSource(transport.vertices, transport.faces, stacked, len(group)), 2 * n,
-            max(1, self.walks // (2 * n)), seed=self.experiment.seed(f"budget {name}"), cameras=cameras, layers=2,
+            lambda group: HatSource(transport.vertices, transport.faces, hats, len(group)), len(hats),
+            max(1, self.walks // len(hats)), seed=self.experiment.seed(f"budget {name}"), cameras=cameras, layers=2,
             deposit=True,
         )  # fmt: skip
         assert traced.deposits is not None
-        for tag, (row, power) in enumerate(zip(row_of, watts, strict=True)):
-            for laser in range(lasers) if len(rows) == 1 else (row,):
-                for half in range(2):
-                    own, scale = tag + half * n, power * (factor[laser] if len(rows) == 1 else 1.0)
-                    power_out[half, laser] += scale * traced.deposits[own, laser]
-                    if images is not None and traced.images is not None:
-                        images[half, :, laser] += scale * traced.images[own, 0, :, laser]
-        return images, power_out
+        for tag in range(len(hats)):
+            half, pattern = tag // len(patterns), patterns[tag % len(patterns)]
+            power[half, pattern.lasers] += pattern.watts[:, None] * traced.deposits[tag, pattern.lasers]
+            if images is not None and traced.images is not None:
+                below = traced.images[tag, 0][:, pattern.lasers]  # the layer from below the surface
+                images[half][:, pattern.lasers] += pattern.watts[:, None, None] * below
+        return images, power
 
     def spot_responses(self, spots: Spots) -> tuple[F64, F64]:
         """(L, S, V) R_d in mm^-2 from beams that enter from all around to the scan's hat functions, and its variance
@@ -176,6 +157,22 @@ class ExactLight:
         return sparse.csc_array(self.basis.T @ RayMesh.of(self.mesh).mass_matrix @ self.basis)
 
 
+def _patterns(density: F64, areas: F64) -> list[_Pattern]:
+    """What to launch for (L, V_fine) W/mm^2: lasers whose light is shaped alike share their photons."""
+    peak = np.abs(density).max(axis=1)
+    share = density / np.maximum(peak, 1e-300)[:, None]
+    every = np.arange(len(density))
+    alike = np.allclose(share, share[:1], rtol=1e-3, atol=1e-6)
+    out = []
+    for lasers in [every] if alike else every[:, None]:
+        shape = share[lasers[0]]
+        for sign in (1.0, -1.0):
+            hat = np.maximum(sign * shape, 0.0)
+            if hat @ areas > NEGLIGIBLE * (np.abs(shape) @ areas):
+                out.append(_Pattern(hat, lasers, sign * (hat @ areas) * peak[lasers]))
+    return out
+
+
 def _solved(mass: sparse.csc_array, moments: F64) -> F64:
     """(N, V) coefficients of hat functions from their (N, V) moments."""
     return np.asarray(sparse_linalg.spsolve(mass, moments.T).reshape(mass.shape[0], -1).T)
@@ -194,23 +191,15 @@ def _footprint(vertices: F64, spots: Spots, spot: int) -> F64:
 
 
 def best_curve(mesh: trimesh.Trimesh, eta: float, seen: Sequence[SeenRadiosity]) -> Boundary:
-    """The one curve of the view cosine that explains all these references best: an oracle, for floors alone."""
-    observed, expected = np.zeros(len(EDGES) - 1), np.zeros(len(EDGES) - 1)
-    for one in seen:
-        camera = one.camera
-        scale = 1.0 / max(float(one.reference.mean()), 1e-300)  # all lights count alike
-        flat = one.reference.sum(axis=0).ravel() * scale
-        model = one.radiosity.sum(axis=0) * scale
-        for band in trace_pixels(mesh, camera, SUPERSAMPLE):
-            whole = np.bincount(band.pixel, minlength=flat.size)[band.pixel] == SUPERSAMPLE**2
-            use = np.flatnonzero(whole & (band.cosine > 0))
-            cosine = band.cosine[use]
-            at = np.searchsorted(EDGES, cosine, side="right") - 1
-            radiosity = (band.barycentric[use] * model[np.asarray(mesh.faces)[band.triangle[use]]]).sum(axis=1)
-            observed += np.bincount(at, flat[band.pixel[use]], len(observed))
-            expected += np.bincount(at, transmittance(cosine, eta) / np.pi * radiosity, len(expected))
-    known = np.flatnonzero(expected > 1e-3 * expected.max(initial=0.0))
-    if not len(known):
-        return Boundary(eta)
-    middle = 0.5 * (EDGES[known] + EDGES[known + 1])
-    return Boundary(eta, tuple(map(float, middle)), tuple(map(float, observed[known] / expected[known])))
+    """The one curve of the view cosine that explains all these references: an oracle, for floors alone.
+
+    seen: with images in W/(mm^2 sr) and radiosities in W/mm^2; each counts by its own mean, so that all lights count
+    alike
+    """
+    scales = [1.0 / max(float(one.image.mean()), 1e-300) for one in seen]
+    weighed = (
+        SeenRadiosity(one.camera, np.pi * scale * one.image, scale * one.radiosity)
+        for one, scale in zip(seen, scales, strict=True)
+    )
+    middle, ratio = ratio_by_cosine(mesh, eta, weighed)
+    return Boundary(eta, tuple(map(float, middle)), tuple(map(float, ratio))) if len(middle) else Boundary(eta)

@@ -19,6 +19,8 @@ from hw.base.arrays import F64
 from pipeline.calibrate.calibration import Calibration, ProjectorCalibration, pair
 from pipeline.geometry.camera import pose_rows
 
+PHOTOMETRIC, POSE, PROJECTOR, ALL = "true photometric", "true pose", "true projector", "all true"
+
 
 def true_calibration(rig: TwinRigConfig, actual: ActualRig, nominal: Calibration) -> Calibration:
     """The calibration that a measurement without error would give. Each mirror move's own error stays out of reach.
@@ -88,8 +90,8 @@ def _seen_from(projectors: Sequence[ProjectorCalibration], frames: Sequence[F64]
 
 # By name: (as measured, true) -> the calibration with that part made true.
 VARIANTS: dict[str, Callable[[Calibration, Calibration], Calibration]] = {
-    "true photometric": _photometric,
-    "true pose": _pose,
-    "true projector": _projector,
-    "all true": lambda _, true: true,
+    PHOTOMETRIC: _photometric,
+    POSE: _pose,
+    PROJECTOR: _projector,
+    ALL: lambda _, true: true,
 }

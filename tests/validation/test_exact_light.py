@@ -8,13 +8,16 @@ from numpy.typing import NDArray
 from scene_fakes import sphere
 from significance import assert_z, z_of_difference, z_of_replicates
 
-from disco_twin.evaluate.exact_light import ExactLight, SeenRadiosity, best_curve
+from disco_twin.evaluate import exact_light
+from disco_twin.evaluate.exact_light import ExactLight, best_curve
 from disco_twin.experiment.experiment import Experiment
+from disco_twin.light.truth import truth_columns
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import Boundary
+from pipeline.reconstruct.global_term.boundary_fit import SeenRadiosity
 from pipeline.reconstruct.samples.spots import Spots
-from pipeline.relight.lights import Uniform
-from pipeline.relight.on_mesh import ViewOfMesh
+from pipeline.relight.lights import Directional, Uniform
+from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 
 F64 = NDArray[np.float64]
 REPLICATES, WALKS = 24, 20_000
@@ -98,3 +101,38 @@ def test_the_spots_exact_responses_hold_all_the_light(ball: Experiment, exact: E
     out = on_hats(exact, whole).sum(axis=1) / exact.areas.sum()
     assert_z(z_of_difference(share, out), "share that leaves")
     assert abs(z_of_replicates(share, 0.9 * out.mean())) > 5
+
+
+def test_light_on_hats_is_what_a_model_of_the_true_entries_relights(ball: Experiment, exact: ExactLight) -> None:
+    """Rationale: the truth's entries are photons of another kind, launched hat by hat. Expected: a model that holds all
+    of them has the radiosity that photons make which enter on the scan's hats and are averaged over them at the exit.
+    """
+    light = Directional(direction=(-0.6, 0.5, -0.6))
+    flux = LightOnMesh(light, exact.scan, Boundary(1.3), 3).flux[0]
+    lit = np.flatnonzero(np.abs(flux) > 1e-4 * flux.max())
+    truth = [truth_columns(ball.transport, exact.basis, lit, 800, seed).replicates[:, 0] for seed in (1, 2)]
+    modelled = flux[lit] @ np.concatenate(truth).astype(float) / exact.mean**2
+    density = exact.entering_on_hats(light)
+    powers = [exact.after_diffuse_entry(f"on hats {k}", density)[1] for k in range(REPLICATES // 2)]
+    hats = np.concatenate([exact.radiosity_on_hats(power, consistent=False)[:, 0] for power in powers])
+    seen = (hats > 0).mean(axis=0) > 0.9  # not where so few photons come that their number is no normal one
+    assert seen.sum() > 60
+    assert_z(z_of_difference(hats[:, seen], modelled[:, seen]), "radiosity")
+    assert_z(z_of_difference(hats.sum(axis=1), modelled.sum(axis=1)), "all of it")
+    projected = np.concatenate([exact.radiosity_on_hats(power, consistent=True)[:, 0] for power in powers])
+    assert np.abs(z_of_difference(projected[:, seen], modelled[:, seen])).max() > 5  # no model of such entries
+
+
+def test_lasers_whose_light_is_shaped_alike_share_their_photons() -> None:
+    """Expected: one pattern for all, with the power of each; a pattern of each sign where the light changes sign; one
+    for each laser where shapes differ; none for black light.
+    """
+    areas, shape = np.array([1.0, 2.0, 1.0]), np.array([1.0, 0.5, -0.5])
+    up, down = exact_light._patterns(np.outer([1.0, 3.0], shape), areas)
+    np.testing.assert_allclose(up.hat, [1.0, 0.5, 0.0])
+    np.testing.assert_allclose(down.hat, [0.0, 0.0, 0.5])
+    np.testing.assert_allclose(up.watts, [2.0, 6.0])
+    np.testing.assert_allclose(down.watts, [-0.5, -1.5])
+    apart = exact_light._patterns(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]), areas)
+    assert [pattern.lasers.tolist() for pattern in apart] == [[0], [1]]
+    assert not exact_light._patterns(np.zeros((3, 3)), areas)

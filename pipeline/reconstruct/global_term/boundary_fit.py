@@ -9,12 +9,14 @@ the ratio is 1 on average where samples were taken (docs/decisions/0093).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 import numpy as np
 import trimesh
 
 from hw.base.arrays import F64
+from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import Boundary, transmittance
 from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.pixel_footprints import trace_pixels
@@ -25,23 +27,37 @@ LEAST, MOST = 0.5, 2.0  # of the smooth transmittance; at the outline itself sca
 SUPERSAMPLE = 3
 
 
-def _accumulate(mesh: trimesh.Trimesh, view: SpotSumImage, radiosity: F64, eta: float) -> tuple[F64, F64]:
-    """Sums over the samples of one view by bin of view cosine: observed, and expected with the smooth F_t.
+@dataclass(frozen=True)
+class SeenRadiosity:
+    """An image and the radiosity that should explain it: image = F_t * radiosity, without a factor between their units.
 
-    radiosity: (L, V) expected sum over the view's spots at the vertices, mm^-2
+    camera; image: (L, H, W); radiosity: (L, V) on a mesh's vertices
     """
-    camera, bins = view.camera, len(EDGES) - 1
+
+    camera: PinholeCamera
+    image: F64
+    radiosity: F64
+
+
+def ratio_by_cosine(mesh: trimesh.Trimesh, eta: float, seen: Iterable[SeenRadiosity]) -> tuple[F64, F64]:
+    """(n,) view cosines, and there (n,) the light of all these images over what the smooth F_t lets out of the
+    radiosity that should explain them; wavelengths together. Cosines that next to no light is expected at are left out.
+    """
+    bins = len(EDGES) - 1
     observed, expected = np.zeros(bins), np.zeros(bins)
-    image = view.image.reshape(len(view.image), -1)
-    for band in trace_pixels(mesh, camera, SUPERSAMPLE):
-        whole = np.bincount(band.pixel, minlength=image.shape[1])[band.pixel] == SUPERSAMPLE**2
-        use = np.flatnonzero(whole & (band.cosine > 0))
-        cosine = band.cosine[use]
-        at = np.minimum(np.searchsorted(EDGES, cosine, side="right") - 1, bins - 1)
-        model = (RayMesh.of(mesh).interpolation(band.triangle[use], band.barycentric[use]) @ radiosity.T).sum(axis=1)
-        observed += np.bincount(at, image[:, band.pixel[use]].sum(axis=0), bins)
-        expected += np.bincount(at, transmittance(cosine, eta) * model, bins)
-    return observed, expected
+    for one in seen:
+        flat = one.image.sum(axis=0).ravel()
+        for band in trace_pixels(mesh, one.camera, SUPERSAMPLE):
+            whole = np.bincount(band.pixel, minlength=flat.size)[band.pixel] == SUPERSAMPLE**2
+            use = np.flatnonzero(whole & (band.cosine > 0))
+            cosine = band.cosine[use]
+            at = np.minimum(np.searchsorted(EDGES, cosine, side="right") - 1, bins - 1)
+            here = RayMesh.of(mesh).interpolation(band.triangle[use], band.barycentric[use])
+            model = (here @ one.radiosity.T).sum(axis=1)
+            observed += np.bincount(at, flat[band.pixel[use]], bins)
+            expected += np.bincount(at, transmittance(cosine, eta) * model, bins)
+    known = np.flatnonzero(expected > 1e-3 * expected.max(initial=0.0))
+    return 0.5 * (EDGES[known] + EDGES[known + 1]), observed[known] / expected[known]
 
 
 def measure_boundary(
@@ -52,18 +68,21 @@ def measure_boundary(
     expected: view -> (L, S, V) mm^-2, the model's R_d between spots and vertices as seen from there, with all that
     directions do beside the boundary: the ratio holds whatever is left.
     """
-    seen, model = np.zeros(len(EDGES) - 1), np.zeros(len(EDGES) - 1)
-    for view in views:
-        radiosity = np.einsum("ls,lsv->lv", view.included.astype(np.float64), expected(view))
-        s, m = _accumulate(mesh, view, radiosity, eta)
-        seen += s
-        model += m
-    known = np.flatnonzero(model > 1e-3 * model.max(initial=0.0))
-    if not len(known):
+    middle, ratio = ratio_by_cosine(
+        mesh,
+        eta,
+        (
+            SeenRadiosity(
+                view.camera,
+                view.image,
+                np.einsum("ls,lsv->lv", view.included.astype(np.float64), expected(view)),
+            )
+            for view in views
+        ),
+    )
+    if not len(middle):
         return Boundary(eta)
-    ratio = np.clip(seen[known] / model[known], LEAST, MOST)
-    middle = 0.5 * (EDGES[known] + EDGES[known + 1])
-    return Boundary(eta, tuple(map(float, middle)), tuple(map(float, ratio)))
+    return Boundary(eta, tuple(map(float, middle)), tuple(map(float, np.clip(ratio, LEAST, MOST))))
 
 
 def of_mean_one(boundary: Boundary, samples: Samples, expected: F64) -> Boundary:

@@ -1,0 +1,5 @@
+"""Fixtures that several modules share."""
+
+from refusals import says
+
+__all__ = ["says"]
