@@ -26,7 +26,7 @@ $(READY): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "disco-twin needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) -V). Remedy: make PYTHON=python3.12 ..."; exit 2; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -e '.[dev]'  # most is never imported
 	@touch $@
 
 # Other people's programs, for outside checks; where one cannot be had, its test is skipped.
@@ -44,11 +44,12 @@ demo: $(READY)
 
 # The laser's timing alone. Then what waits for devices, in a process of its own that gets a core whenever it wants one,
 # beside what computes, on every core; each worker's linear algebra keeps to one of them.
+DEVICES := tests/unit/hw tests/unit/disco_twin/emulation tests/system/test_rig.py
 DEVICE_LOG := $(VENV)/devices.log
 test: $(CLIENTS)
 	@status=0; \
-	$(BIN)/python -m pytest -m timing || status=1; \
-	$(BIN)/python -m pytest -m "device and not (slow or timing)" >$(DEVICE_LOG) 2>&1 & devices=$$!; \
+	$(BIN)/python -m pytest $(DEVICES) -m timing || status=1; \
+	$(BIN)/python -m pytest $(DEVICES) -m "not (slow or timing)" >$(DEVICE_LOG) 2>&1 & devices=$$!; \
 	OMP_NUM_THREADS=1 nice -n 10 $(BIN)/python -m pytest -n auto -m "not (device or slow or timing)" || status=1; \
 	wait $$devices || status=1; \
 	echo "tests of devices, which ran at the same time:"; cat $(DEVICE_LOG); \

@@ -28,13 +28,18 @@ DEVICES = ("unit/hw", "unit/disco_twin/emulation", "system/test_rig.py")  # test
 
 @pytest.hookimpl(tryfirst=True)  # before `-m` chooses by marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of devices; put the files that take longest first."""
+    """Mark the tests of devices; put the files that take longest first.
+
+    Raises: pytest.UsageError where a laser's timing is tested elsewhere: `make test` looks for it there alone.
+    """
     here = Path(__file__).parent
     places = {name: k for k, name in enumerate(LONGEST_FIRST)}
     items.sort(key=lambda item: places.get(item.path.relative_to(here).parts[0], len(places)))
     for item in items:
         if any(item.path.is_relative_to(here / place) for place in DEVICES):
             item.add_marker("device")
+        elif item.get_closest_marker("timing"):
+            raise pytest.UsageError(f"{item.nodeid} is of timing, but stands in none of {DEVICES}")
 
 
 @pytest.fixture(scope="session")

@@ -8,28 +8,28 @@ from pathlib import Path
 
 import pytest
 
-MARKS = ("device", "slow", "timing")
-
-
-def expressions(repository: Path) -> list[str]:
-    """What the recipe of `make test` hands to pytest's -m."""
-    (recipe,) = re.findall(r"^test:.*\n((?:\t.*\n)+)", (repository / "Makefile").read_text(), re.M)
-    return [quoted or word for quoted, word in re.findall(r'-m pytest .*?-m (?:"([^"]+)"|(\w+))', recipe)]
-
 
 def test_every_fast_test_is_in_one_group(repository: Path) -> None:
-    """An expression of -m is one of Python's, whose names say whether a test has the mark."""
-    groups = expressions(repository)
+    """A test of devices is one that stands in the folders that the first two groups look in.
+
+    An expression of pytest's -m is one of Python's, whose names say whether a test has the mark.
+    """
+    makefile = (repository / "Makefile").read_text()
+    (recipe,) = re.findall(r"^test:.*\n((?:\t.*\n)+)", makefile, re.M)
+    groups = re.findall(r'-m pytest (\$\(DEVICES\) )?.*?-m (?:"([^"]+)"|(\w+))', recipe)
     assert len(groups) == 3
-    for has in itertools.product((False, True), repeat=len(MARKS)):
-        marks = dict(zip(MARKS, has, strict=True))
-        if not marks["slow"]:
-            assert sum(eval(group, {}, marks) for group in groups) == 1, marks
+    for device, slow, timing in itertools.product((False, True), repeat=3):
+        marks = {"device": device, "slow": slow, "timing": timing}
+        runs = [eval(quoted or word, {}, marks) for where, quoted, word in groups if device or not where]
+        if not slow and (device or not timing):  # tests/conftest.py refuses tests of timing that are not of devices
+            assert sum(runs) == 1, marks
 
 
-def test_tests_of_devices_are_marked_by_their_folder(request: pytest.FixtureRequest) -> None:
-    """Of all that was collected with this one: those in the rooms of devices, and the rig's commands."""
+def test_tests_of_devices_are_marked_by_their_folder(repository: Path, request: pytest.FixtureRequest) -> None:
+    """Of all that was collected with this one, those in the folders that `make test` looks for them in."""
+    (listed,) = re.findall(r"^DEVICES := (.*)$", (repository / "Makefile").read_text(), re.M)
+    folders = [repository / name for name in listed.split()]
+    assert all(folder.exists() for folder in folders)
     for item in request.session.items:
-        parts = item.path.parts
-        of_devices = "hw" in parts or "emulation" in parts or item.path.name == "test_rig.py"
+        of_devices = any(item.path.is_relative_to(folder) for folder in folders)
         assert of_devices == (item.get_closest_marker("device") is not None), item.nodeid

@@ -96,7 +96,8 @@ def test_agrees_with_stock_volpath(boundary: TwinBoundary, heterogeneous: bool, 
     assert_z(z_of_difference(ours[:, seen], theirs[:, seen]), "blocks")
     assert_z(z_of_difference(ours.mean(axis=1), theirs.mean(axis=1)), "whole image")
     black = replace(obj.medium, sigma_t=obj.medium.sigma_t * 100, albedo=obj.medium.albedo * 0)
-    shine = blocks(volpath_images(replace(obj, medium=black), camera, light, tmp_path, passes, spp))
+    enough = 4 if boundary.kind == "matched" else spp  # there is none to be seen
+    shine = blocks(volpath_images(replace(obj, medium=black), camera, light, tmp_path, passes, enough))
     assert_z(z_of_difference(below[:, seen], (theirs - shine)[:, seen]), "light from below the surface")
     if boundary.kind == "matched":
         assert not shine.any()

@@ -19,6 +19,11 @@ def quick(repository: Path) -> Scene:
     return load_scene(repository / "scenes" / "quick.toml")
 
 
+@pytest.fixture(scope="module")
+def quick_object(quick: Scene) -> TwinObject:
+    return build_object(quick)
+
+
 def test_every_scene_builds(repository: Path) -> None:
     paths = sorted((repository / "scenes").glob("*.toml"))
     assert {"quick", "slab"} <= {path.stem for path in paths}
@@ -30,8 +35,8 @@ def test_every_scene_builds(repository: Path) -> None:
         assert len(built.medium.sigma_t) == len(built.medium.g) == len(scene.rig.lasers)
 
 
-def test_quick_is_as_large_as_promised(quick: Scene) -> None:
-    built = build_object(quick)
+def test_quick_is_as_large_as_promised(quick: Scene, quick_object: TwinObject) -> None:
+    built = quick_object
     scan = build_scan(quick, built.mesh)
     assert len(quick.rig.lasers) == 3
     assert len(quick.rig.cameras) * len(quick.rig.turntable_angles_deg) == 6
@@ -42,14 +47,14 @@ def test_quick_is_as_large_as_promised(quick: Scene) -> None:
     assert built.medium.sigma_t.std() > 0.1 * built.medium.sigma_t.mean()  # heterogeneous
 
 
-def test_quick_needs_one_walk_for_three_wavelengths(quick: Scene) -> None:
-    medium = build_object(quick).medium
+def test_quick_needs_one_walk_for_three_wavelengths(quick_object: TwinObject) -> None:
+    medium = quick_object.medium
     assert np.ptp(medium.sigma_t, axis=0).max() < 1e-6
     assert np.ptp(medium.albedo, axis=0).max() > 0.1
 
 
-def test_quick_fills_its_images(quick: Scene) -> None:
-    vertices = np.array(build_object(quick).mesh.vertices)
+def test_quick_fills_its_images(quick: Scene, quick_object: TwinObject) -> None:
+    vertices = np.array(quick_object.mesh.vertices)
 
     def extent(camera: CameraConfig, angle_deg: float) -> tuple[float, float]:
         """Smallest margin to the image's border and height of the object, in pixels."""

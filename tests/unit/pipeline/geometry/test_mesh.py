@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,13 +14,14 @@ from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.nominal_rig import CameraConfig
 from pipeline.geometry.pixel_footprints import trace_pixels, window
 from pipeline.reconstruct.global_term.harmonics import harmonics
-from pipeline.reconstruct.samples.distances import hat_points, spot_pairs, vertex_pairs
+from pipeline.reconstruct.samples.distances import Pairs, hat_points, spot_pairs, vertex_pairs
 from pipeline.reconstruct.samples.image_operators import bilinear_reading, footprint_reading, image_points, see_surface
 from pipeline.reconstruct.samples.spots import Spots
 
 
+@cache
 def plane(n: int = 24, edge: float = 1.0) -> trimesh.Trimesh:
-    """A flat patch of equilateral triangles."""
+    """A flat patch of equilateral triangles. Not to be changed."""
     i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
     points = np.column_stack([(i + 0.5 * (j % 2)).ravel() * edge, j.ravel() * edge * np.sqrt(3) / 2, np.zeros(n * n)])
     faces = []
@@ -28,6 +30,12 @@ def plane(n: int = 24, edge: float = 1.0) -> trimesh.Trimesh:
             p, q, r, s = a * n + b, (a + 1) * n + b, a * n + b + 1, (a + 1) * n + b + 1
             faces += [[p, q, s], [p, s, r]] if b % 2 else [[p, q, r], [q, s, r]]
     return trimesh.Trimesh(points, faces, process=False)
+
+
+@cache
+def pairs_of_plane(n: int = 24) -> Pairs:
+    """Of its vertices."""
+    return vertex_pairs(plane(n))
 
 
 def middle_of(mesh: trimesh.Trimesh) -> int:
@@ -138,7 +146,7 @@ def test_averaging_conserves_energy(length: float) -> None:
     if length < 2:
         total = spot_pairs(mesh, one_spot(mesh, 0.4)).mean(kernel)[0] @ area
         assert total == pytest.approx(1.0, rel=0.02)
-    total = vertex_pairs(mesh).mean(kernel)[middle_of(mesh)] @ area
+    total = pairs_of_plane(28).mean(kernel)[middle_of(mesh)] @ area
     assert total == pytest.approx(1.0, rel=0.02 if length < 2 else 0.15)  # a wide kernel leaves the patch
 
 
@@ -159,7 +167,7 @@ def test_mean_of_a_gaussian_is_the_wider_gaussian() -> None:
 def test_far_pairs_continue_near_ones(length: float) -> None:
     """Rationale: an exponential averaged by histogram and by second moments, on either side of the limit."""
     mesh = plane()
-    pairs = vertex_pairs(mesh)
+    pairs = pairs_of_plane()
     row = pairs.distance[middle_of(mesh)]
 
     def kernel(d):  # type: ignore[no-untyped-def]

@@ -11,6 +11,7 @@ from reconstruct_synthetic import Synthetic, make, rmse_log10
 
 from pipeline.geometry.fresnel import Boundary
 from pipeline.geometry.mesh import RayMesh
+from pipeline.model.reflectance import GlobalTerm
 from pipeline.reconstruct.global_term import completion
 from pipeline.reconstruct.global_term.completion import (
     RANGE_EDGES,
@@ -31,6 +32,12 @@ from pipeline.reconstruct.samples.spots import forward_component
 def field(small: Synthetic) -> SymmetricField:
     s = small.samples
     return SymmetricField.of(harmonics(s.mesh, 500), s.lit, 3.0)
+
+
+@pytest.fixture(scope="module")
+def completed(small: Synthetic) -> GlobalTerm:
+    """The small object's R_d."""
+    return complete(small.samples).terms[0]
 
 
 def test_solve_agrees_with_the_dense_normal_equations(small: Synthetic, field: SymmetricField) -> None:
@@ -56,9 +63,9 @@ def test_solve_agrees_with_the_dense_normal_equations(small: Synthetic, field: S
     np.testing.assert_allclose(y, y.T)
 
 
-def test_completes_what_was_not_measured(small: Synthetic) -> None:
+def test_completes_what_was_not_measured(small: Synthetic, completed: GlobalTerm) -> None:
     """Expected behaviour: entries without any sample near them come out nearly as well as measured ones."""
-    model = complete(small.samples).terms[0]
+    model = completed
     r = model.reflectance[0]
     np.testing.assert_array_equal(r, r.T)
     assert (r > 0).all()
@@ -71,10 +78,9 @@ def test_completes_what_was_not_measured(small: Synthetic) -> None:
     assert ratio.std() < 0.06
 
 
-def test_variance_covers_the_error(small: Synthetic) -> None:
+def test_variance_covers_the_error(small: Synthetic, completed: GlobalTerm) -> None:
     """Expected behaviour: errors are within a few of the stated deviations, and rarely beyond."""
-    model = complete(small.samples).terms[0]
-    z = (model.reflectance[0] - small.truth[0]) / np.sqrt(model.variance[0])
+    z = (completed.reflectance[0] - small.truth[0]) / np.sqrt(completed.variance[0])
     assert np.sqrt((z**2).mean()) < 1.5
     assert (np.abs(z) > 4).mean() < 0.01
 
@@ -182,7 +188,7 @@ def test_the_boundary_is_compared_with_what_each_view_expects(monkeypatch: pytes
     np.testing.assert_allclose(ratio, slope * difference, atol=1e-5)
 
 
-def test_size_does_not_matter(small: Synthetic) -> None:
+def test_size_does_not_matter(small: Synthetic, completed: GlobalTerm) -> None:
     """Rationale: the same object ten times as large: R_d is a hundredth. Nothing in the method is a length in mm."""
     s = small.samples
     mesh = s.mesh.copy()
@@ -192,7 +198,7 @@ def test_size_does_not_matter(small: Synthetic) -> None:
         s, mesh=mesh, spots=spots, values=s.values / 100, dark_variance=s.dark_variance / 1e4,
         noise_per_signal=s.noise_per_signal / 100,
     )  # fmt: skip
-    np.testing.assert_allclose(100 * complete(grown).terms[0].reflectance, complete(s).terms[0].reflectance, rtol=0.02)
+    np.testing.assert_allclose(100 * complete(grown).terms[0].reflectance, completed.reflectance, rtol=0.02)
 
 
 def test_a_spot_pulls_the_model_as_far_as_its_precision_says(small: Synthetic, field: SymmetricField) -> None:
