@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import trimesh
 from axis_truth import true_axis
 from calibrate_twin import Silhouettes, experiment, faulty_rig, floodlit, photograph, silhouettes
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from pipeline.calibrate import pose
 from pipeline.calibrate.pose import PoseFit, fit_poses
 from pipeline.geometry.camera import PinholeCamera, turn
 
@@ -27,10 +29,10 @@ def pushed(seen: Silhouettes, rng: np.random.Generator) -> list[PinholeCamera]:
     out = []
     for lens in seen.lenses:
         axis, shift = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
-        pose = lens.pose.copy()
-        pose[:3, :3] = Rotation.from_rotvec(np.deg2rad(10) * axis).as_matrix() @ pose[:3, :3]
-        pose[:3, 3] += 10 * shift
-        out.append(replace(lens, pose=pose))
+        moved = lens.pose.copy()
+        moved[:3, :3] = Rotation.from_rotvec(np.deg2rad(10) * axis).as_matrix() @ moved[:3, :3]
+        moved[:3, 3] += 10 * shift
+        out.append(replace(lens, pose=moved))
     return out
 
 
@@ -47,10 +49,19 @@ def test_an_irregular_object_is_found_from_afar() -> None:
     assert found.residual_px < 0.05
 
 
-def test_a_broken_stage_shows() -> None:
-    """Half a pixel, a turntable that runs the other way and degrees taken for radians: the bounds are missed."""
+@pytest.fixture(scope="module")
+def seen() -> Silhouettes:
+    """The scan before a seeded rig."""
+    return silhouettes(4, experiment().scan)
+
+
+def test_a_broken_stage_shows(seen: Silhouettes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half a pixel, a turntable that runs the other way and degrees taken for radians: the bounds are missed.
+
+    From the nominal pose alone: from the six that are tried when it ends badly, no turn fits any better.
+    """
+    monkeypatch.setattr(pose, "_STARTS", pose._STARTS[:1])
     mesh = experiment().scan
-    seen = silhouettes(4, mesh)
     lens, shifted = seen.lenses[0], replace(seen.lenses[0], centre=seen.lenses[0].centre + 0.5)
     for start, angles in (
         (shifted, seen.angles),
@@ -85,11 +96,9 @@ def test_a_symmetric_object_gets_a_stated_ambiguity() -> None:
     assert np.rad2deg(found.rotation.max()) > 1.0
 
 
-def test_all_views_share_one_axis() -> None:
+def test_all_views_share_one_axis(seen: Silhouettes) -> None:
     """The turns that were found are rotations about one line, by nearly the nominal angles."""
-    mesh = experiment().scan
-    seen = silhouettes(4, mesh)
-    found = fit_poses(seen.images, mesh, seen.lenses, seen.angles)
+    found = fit_poses(seen.images, experiment().scan, seen.lenses, seen.angles)
     axes = [Rotation.from_matrix(t[:3, :3]).as_rotvec() for t in found.turns[1:]]
     wanted = [Rotation.from_matrix(turn(a)[:3, :3]).as_rotvec() for a in seen.angles[1:]]
     for axis, near in zip(axes, wanted, strict=True):
