@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-# Two lights instead of seven and a fifth of the spots; `--profile small` shrinks what is left.
+# Two lights instead of seven, half of the spots, a scan of 300 vertices; `--profile small` shrinks what is left.
 SHRINK = """
 [simulation]
-walks_per_spot = 60_000
+walks_per_spot = 30_000
 truth_columns = 16
-truth_walks = 1_000_000
+truth_walks = 400_000
 reference_noise = 0.04
 
 [relight]
@@ -46,6 +46,7 @@ def scene(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     text = (repository / "scenes" / "quick.toml").read_text()
     text = re.sub(r"\[simulation\]\n(?:[^\[\n].*\n|\n)*", "", text)
     text = text.replace("[[relight.views]]", SHRINK + "[[relight.views]]", 1).replace("vertices = ", "vertices = 300 #")
+    text = text.replace("spots = 300", "spots = 160", 1)
     path = tmp_path_factory.mktemp("scene") / "small.toml"
     path.write_text(text)
     return path
@@ -90,8 +91,8 @@ def test_summary_has_exactly_what_the_design_says(summary: dict[str, Any]) -> No
     assert names[:5] == ["scan", "targets", "capture", "truth", "references"]
     assert all(s["seconds"] > 0 and 10 < s["peak_mb"] < 8000 for s in summary["stages"])
     capture = summary["capture"]
-    assert (capture["views"], capture["spots"], capture["wavelengths"]) == (6, 75, 3)
-    assert capture["images"] == 6 + 2 * 3 * 75
+    assert (capture["views"], capture["spots"], capture["wavelengths"]) == (6, 40, 3)
+    assert capture["images"] == 6 + 2 * 3 * 40
     assert 0 < capture["bytes_stored"] < capture["bytes_raw"]
     for key in ("log10_rmse_by_decade", "log10_rmse_all_by_decade", "coverage_by_decade"):
         assert set(summary["reflectance"][key]) == {"0", "-1", "-2", "-3"}
@@ -118,7 +119,7 @@ def test_every_light_view_and_method_is_scored(summary: dict[str, Any]) -> None:
 
 
 def test_the_default_method_relights_and_beats_the_lambertian(summary: dict[str, Any]) -> None:
-    """Loose: a quarter of the pixels and spots, a hundredth of the light. The full figures are the demo's."""
+    """Loose: a quarter of the pixels, few spots, vertices and photons. The full figures are the demo's."""
     errors = {(r["light"], r["view"], r["method"]): r["nrmse"] for r in summary["relit"]}
     for (light, view, method), error in errors.items():
         if method == "default":

@@ -1,4 +1,9 @@
-"""The whole calibration from a capture's own images, against what the twin knows."""
+"""The whole calibration from a capture's own images, against what the twin knows.
+
+All slow: of every change, the run of quick (tests/regression) holds poses, projector, spots and samples to the figures
+of one calibration, closer than the bounds here; the frame of the scan is `test_projector_fit`'s, the power of an image
+`test_photometric`'s, and each stage's own tests see to its uncertainties.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +29,8 @@ from pipeline.calibrate.calibration import Calibration, nominal_calibration
 from pipeline.calibrate.figures import figures
 from pipeline.plan.plan import load_plan
 from pipeline.stream.stream import StreamReader
+
+pytestmark = pytest.mark.slow
 
 
 @dataclass(frozen=True)
@@ -165,7 +172,6 @@ def test_the_power_of_every_image_is_known(captured: tuple[Path, TwinRigConfig])
     assert (np.ptp(watts, axis=1) > 0.1 * np.mean(watts, axis=1))[[0, 2]].all()
 
 
-@pytest.mark.slow
 def test_a_rig_with_curved_cameras_is_calibrated_as_well(tmp_path: Path) -> None:
     """The same bounds as for linear ones, from brackets that the cameras took; the calibration holds the response."""
     rig = capture_all(tmp_path, 11, curved=True)
@@ -179,7 +185,6 @@ def test_a_rig_with_curved_cameras_is_calibrated_as_well(tmp_path: Path) -> None
     assert figures(found)["response"]["error_share"] < 0.005
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(1500)
 def test_uncertainties_are_honest(tmp_path: Path) -> None:
     """Rationale: twelve rigs with all faults of light and place, and a source whose peaks wander as the twin's do.
