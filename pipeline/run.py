@@ -39,7 +39,7 @@ from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import Boundary
 from pipeline.geometry.mesh_file import read_scan
 from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
-from pipeline.model.relightable import RelightableModel
+from pipeline.model.relightable import WITHOUT, RelightableModel
 from pipeline.plan.targets import FOLDER
 from pipeline.reconstruct.methods import reconstruct
 from pipeline.reconstruct.omissions import omissions
@@ -162,6 +162,9 @@ def run(capture: Path, work: Path, request: Request, given: Path | None = None) 
             models[name] = reconstruct(samples[known_methods()[name].reads], name)
             models[name].save(work / f"model-{name}.npz")
         seconds[name] = stages.rows[-1]["seconds"]
+        for what, because in models[name].provenance.items():
+            if what.startswith(WITHOUT):
+                left_out.append({"what": f"{what.removeprefix(WITHOUT)} of {name}", "because": because})
     relit = relight(models, request, work, stages)
     result = {
         "format_version": FORMAT_VERSION,

@@ -142,7 +142,7 @@ class OpenedRun:
             "dark_variance": _array(given.dark_variance, entry, "mm-4"),
             "noise_per_signal": _array(given.noise_per_signal, entry, "mm-2"),
             "oblique_variance": _array(given.oblique, "spot vertex", "1"),
-            "direction_bias": _array(given.direction_bias, "spot vertex", "1"),
+            "tilt": _array(given.tilt, "spot vertex", "1"),
             "view_cosine": _array(given.cosine, "spot vertex", "1"),
             "spot_position": _array(given.spots.position, place, "mm"),
             "spot_direction": _array(given.spots.direction, place, "1"),

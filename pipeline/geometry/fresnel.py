@@ -81,3 +81,11 @@ def mean_transmittance(eta: float) -> float:
         + 8 * m4 * (m4 + 1) / ((m2 + 1) * (m4 - 1) ** 2) * math.log(m)
     )
     return 1.0 - reflectance
+
+
+def along_surface(direction: F64, normal: F64, eta: float) -> F64:
+    """(..., 3) the part along the surface of the refracted direction of travel, of length sin(theta) / eta (Snell).
+
+    direction: unit, of travel outside, in or out; normal: unit. The part is the same on both ways through.
+    """
+    return np.asarray((direction - (direction * normal).sum(axis=-1, keepdims=True) * normal) / eta)

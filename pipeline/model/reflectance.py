@@ -9,18 +9,22 @@ from typing import Annotated, ClassVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from hw.base.arrays import F32, F64, I64, Bool
 from pipeline.model.term import Axes, ReflectanceColumns, Term
+from pipeline.model.tilt import TiltLaw
 from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 
 _PAIRS = "laser vertex_in vertex_out"
+_ROWS = 512
 
 
 @dataclass(frozen=True)
 class GlobalTerm(Term):
     """reflectance: (L, V_in, V_out) mm^-2, symmetric, mean over both hat functions; measured: (V, V) entries that an
-    observed spot near one vertex and the other one support; variance: mm^-4, None where the method states none
+    observed spot near one vertex and the other one support; variance: mm^-4, None where the method states none;
+    tilt: slopes of the `TiltLaw`s at tilt_distance, None where directions are not known to change anything
     """
 
     kind: ClassVar[str] = "global"
@@ -28,12 +32,48 @@ class GlobalTerm(Term):
     reflectance: Annotated[F32, Axes(_PAIRS, "mm^-2")]
     measured: Annotated[Bool, Axes("vertex_in vertex_out", "1", kind="b")]
     variance: Annotated[F32 | None, Axes(_PAIRS, "mm^-4")] = None
+    tilt: Annotated[F64 | None, Axes("laser distance", "1")] = None
+    tilt_distance: Annotated[F64 | None, Axes("distance", "mm")] = None
 
     def image(self, light: LightOnMesh, view: ViewOfMesh) -> F32:
-        """Radiosity on the vertices (thesis 5.3: B = E F), linear on the faces."""
+        """Radiosity on the vertices (thesis 5.3: B = E F) and its first moments, linear on the faces."""
         if light not in self._radiosity:
-            self._radiosity[light] = np.stack([q @ r for q, r in zip(light.flux, self.reflectance, strict=True)])
-        return view.image(self._radiosity[light])
+            self._radiosity[light] = self._radiosity_under(light)
+        radiosity, *moments = self._radiosity[light]
+        image = view.image(radiosity)
+        for matrix, moment in zip(view.tilted_matrices if moments else (), moments, strict=True):
+            flat = np.asarray(matrix @ moment.T)
+            image += np.moveaxis(flat.reshape(*image.shape[1:], -1), -1, 0).astype(np.float32)
+        return image
+
+    def _radiosity_under(self, light: LightOnMesh) -> F64:
+        """(1 or 4, L, V) W/mm^2: the radiosity, and what leaves ahead of it: sums of q R_d s e, by component.
+
+        The factor of either end is kept to first order, their product is left out. Some rows at a time: no matrix is
+        kept beside R_d.
+        """
+        if self.tilt is None or self.tilt_distance is None:
+            return np.stack([q @ r for q, r in zip(light.flux, self.reflectance, strict=True)])[None]
+        points, flux = np.asarray(light.mesh.vertices, np.float64), light.tilted_flux
+        out = np.zeros((4, *flux.shape[1:]))
+        for first in range(0, len(points), _ROWS):
+            rows = slice(first, first + _ROWS)
+            distance = cdist(points[rows], points)
+            for laser, slopes in enumerate(self.tilt):
+                reflectance = self.reflectance[laser, rows].astype(np.float64)
+                q, *along = flux[:, laser, rows]
+                out[0, laser] += q @ reflectance
+                # q R_d s e with e = (x_o - x_i) / r: the products with x_o stand outside the sum over x_i.
+                law = TiltLaw(self.tilt_distance, slopes)
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    kernel = np.where(distance > 0, reflectance * law(distance) / distance, 0.0)
+                moved = np.stack(
+                    [*along, (np.stack(along, axis=1) * points[rows]).sum(axis=1), q, *(q * points[rows].T)]
+                )
+                a, own, light_here, placed = np.split(moved @ kernel, [3, 4, 5])
+                out[0, laser] += (a.T * points).sum(axis=1) - own[0]
+                out[1:, laser] += light_here * points.T - placed
+        return out
 
     def image_variance(self, light: LightOnMesh, view: ViewOfMesh) -> F32 | None:
         """Independent errors add up in squares from entry to vertex to pixel; errors that are alike simply add up."""
@@ -53,13 +93,22 @@ class GlobalTerm(Term):
 
     @cached_property
     def _radiosity(self) -> WeakKeyDictionary[LightOnMesh, F64]:
-        """(L, V) W/mm^2 by light: the product costs more than the image, and serves all views."""
+        """`_radiosity_under` by light: the product costs more than the image, and serves all views."""
         return WeakKeyDictionary()
 
     def check(self, lasers: int, vertices: int) -> None:
-        """Raises: ValueError as every term, and for a matrix that is not symmetric to float32's rounding."""
+        """Raises: ValueError as every term, for a matrix that is not symmetric to float32's rounding, and for a tilt's
+        slopes without distances in order.
+        """
         super().check(lasers, vertices)
+        distance = self.tilt_distance
+        if (self.tilt is None) != (distance is None):
+            raise ValueError(f"{self.kind}.tilt: slopes and their distances come together")
+        if distance is not None and not (np.diff(distance, prepend=0.0) > 0).all():
+            raise ValueError(f"{self.kind}.tilt_distance: is not above 0 and ascending")
         for name, array in self.arrays().items():
+            if "vertex_out" not in self.axes()[name].names:
+                continue
             other = array.swapaxes(-1, -2)
             if not np.array_equal(array, other) and not np.allclose(array, other, 1e-4, 1e-6 * float(array.max())):
                 raise ValueError(f"{self.kind}.{name}: is not symmetric")

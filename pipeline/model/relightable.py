@@ -23,6 +23,7 @@ from pipeline.relight.lights import Light
 from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 
 FORMAT_VERSION = 2
+WITHOUT = "without "  # in a provenance, before the name of what a method left out; the value is the reason
 KINDS: Mapping[str, type[Term]] = {term.kind: term for term in (GlobalTerm, LambertianTerm)}
 REMEDY = "reconstruct again with this version"
 

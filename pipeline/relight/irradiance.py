@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse import linalg as sparse_linalg
 
 from hw.base.arrays import F64, I64
-from pipeline.geometry.fresnel import Boundary, transmittance
+from pipeline.geometry.fresnel import Boundary, along_surface, transmittance
 from pipeline.geometry.mesh import RayMesh
 from pipeline.relight.incident_light import colour, finest_mm, from_many_directions, from_one_direction
 from pipeline.relight.lights import Environment, Light, Uniform
@@ -54,14 +54,29 @@ def received(
     surface: RayMesh, light: Light, face: I64, points: F64, eta: float | Boundary, lasers: int, directions: int = 256
 ) -> F64:
     """(L, N) transmitted flux density T in W/mm^2 at (N, 3) points on (N,) faces. eta = 1: the plain irradiance."""
+    return np.asarray(_received(surface, light, face, points, eta, lasers, directions, tilted=False)[0])
+
+
+def _received(
+    surface: RayMesh, light: Light, face: I64, points: F64, eta: float | Boundary, lasers: int, count: int, tilted: bool
+) -> F64:
+    """(1, L, N) T, or (4, L, N) with the components of T's first moment, integral L(x, w) F_t(w) cos t(w) dw."""
     if isinstance(light, Uniform | Environment):
-        return _received_from_many(surface, light, face, points, eta, lasers, directions)
+        return _received_from_many(surface, light, face, points, eta, lasers, count, tilted)
     towards, across = from_one_direction(light, points)
-    cosine = (towards * surface.normals[face]).sum(axis=1)
+    normal = surface.normals[face]
+    cosine = (towards * normal).sum(axis=1)
     density = np.where(cosine > 0, across * transmittance(cosine, eta) * cosine, 0.0)
     lit = np.flatnonzero(density > 0)
     density[lit[surface.blocked(face[lit], points[lit], towards[lit])]] = 0.0
-    return np.asarray(colour(light, lasers)[:, None] * density)
+    part = density[None]
+    if tilted:
+        part = np.concatenate([part, density * along_surface(-towards, normal, _index(eta)).T])
+    return np.asarray(colour(light, lasers)[:, None] * part[:, None])
+
+
+def _index(eta: float | Boundary) -> float:
+    return eta.eta if isinstance(eta, Boundary) else eta
 
 
 def _received_from_many(
@@ -72,8 +87,9 @@ def _received_from_many(
     eta: float | Boundary,
     lasers: int,
     count: int,
+    tilted: bool,
 ) -> F64:
-    total = np.zeros((lasers, len(face)))
+    total = np.zeros((4 if tilted else 1, lasers, len(face)))
     step = max(1, _CHUNK // count)
     for start in range(0, len(face), step):
         part = slice(start, start + step)
@@ -85,7 +101,10 @@ def _received_from_many(
             ask = np.nonzero((ft > 0) & ~surface.free[f][:, None])
             hidden = surface.blocked(f[ask[0]], p[ask[0]], towards[ask])
             ft[ask[0][hidden], ask[1][hidden]] = 0.0
-            total[:, part] += np.einsum("lnk,nk->ln", weight, ft)
+            total[0, :, part] += np.einsum("lnk,nk->ln", weight, ft)
+            if tilted:
+                along = along_surface(-towards, normals[:, None], _index(eta))
+                total[1:, :, part] += np.einsum("lnk,nkx->xln", weight, ft[:, :, None] * along)
     return total
 
 
@@ -110,43 +129,64 @@ def _split(face: I64, bary: F64) -> tuple[I64, F64]:
 
 
 def _moments(
-    surface: RayMesh, light: Light, face: I64, bary: F64, eta: float | Boundary, lasers: int, directions: int
+    surface: RayMesh,
+    light: Light,
+    face: I64,
+    bary: F64,
+    eta: float | Boundary,
+    lasers: int,
+    directions: int,
+    tilted: bool,
 ) -> F64:
-    """(L, C, 3) integrals of T times the face's three hat functions over each cell, in W."""
+    """(1 or 4, L, C, 3) W: integrals of what `_received` returns times the face's hat functions over each cell."""
     at = np.einsum("pj,cjb->cpb", _RULE, bary)  # (C, 3 points, 3)
     flat = at.reshape(-1, 3)
     owner = np.repeat(face, 3)
-    density = received(surface, light, owner, surface.points(owner, flat), eta, lasers, directions)
+    density = _received(surface, light, owner, surface.points(owner, flat), eta, lasers, directions, tilted)
     area = surface.areas[face] * np.abs(np.linalg.det(bary)) / 3
-    return np.asarray(np.einsum("lcp,cpb,c->lcb", density.reshape(lasers, -1, 3), at, area))
+    return np.asarray(np.einsum("mlcp,cpb,c->mlcb", density.reshape(*density.shape[:2], -1, 3), at, area))
 
 
 def hat_moments(
     light: Light, mesh: trimesh.Trimesh, eta: float | Boundary, lasers: int, accuracy: Accuracy | None = None
 ) -> F64:
     """(L, V) integrals of hat_u T dA in W; they add up to all the flux that passes the boundary."""
-    accuracy = accuracy or Accuracy()
+    return np.asarray(_integrated(light, mesh, eta, lasers, accuracy or Accuracy(), tilted=False)[0])
+
+
+def tilted_moments(
+    light: Light, mesh: trimesh.Trimesh, boundary: Boundary, lasers: int, accuracy: Accuracy | None = None
+) -> F64:
+    """(4, L, V) W: `hat_moments`, and the same of T times the mean of t, the refracted direction along the surface
+    (`pipeline.model.tilt`), by component. Cells are split where T itself asks for it.
+    """
+    return _integrated(light, mesh, boundary, lasers, accuracy or Accuracy(), tilted=True)
+
+
+def _integrated(
+    light: Light, mesh: trimesh.Trimesh, eta: float | Boundary, lasers: int, accuracy: Accuracy, tilted: bool
+) -> F64:
     surface = RayMesh.of(mesh)
     face, bary = _first_cells(surface, light)
-    total = np.zeros((lasers, surface.vertices))
+    total = np.zeros((4 if tilted else 1, lasers, surface.vertices))
 
     def add(owner: I64, part: F64) -> None:
-        for laser in range(lasers):
-            total[laser] += np.bincount(surface.faces[owner].ravel(), part[laser].ravel(), surface.vertices)
+        for m, laser in np.ndindex(total.shape[:2]):
+            total[m, laser] += np.bincount(surface.faces[owner].ravel(), part[m, laser].ravel(), surface.vertices)
 
-    coarse = _moments(surface, light, face, bary, eta, lasers, accuracy.directions)
+    coarse = _moments(surface, light, face, bary, eta, lasers, accuracy.directions, tilted)
     for _ in range(0 if isinstance(light, Uniform | Environment) else accuracy.splits):
         kids, kid_bary = _split(face, bary)
-        fine = _moments(surface, light, kids, kid_bary, eta, lasers, accuracy.directions)
-        better = fine.reshape(lasers, len(face), 4, 3).sum(axis=2)
-        error = np.abs(better - coarse).sum(axis=2).max(axis=0)
-        allowed = accuracy.tolerance * float((total.sum(axis=1) + better.sum(axis=(1, 2))).max())
+        fine = _moments(surface, light, kids, kid_bary, eta, lasers, accuracy.directions, tilted)
+        better = fine.reshape(len(fine), lasers, len(face), 4, 3).sum(axis=3)
+        error = np.abs(better[0] - coarse[0]).sum(axis=2).max(axis=0)
+        allowed = accuracy.tolerance * float((total[0].sum(axis=1) + better[0].sum(axis=(1, 2))).max())
         order = np.argsort(error)
         again = np.zeros(len(face), bool)
         again[order[np.cumsum(error[order]) > allowed]] = True
-        add(face[~again], better[:, ~again])
+        add(face[~again], better[:, :, ~again])
         chosen = np.repeat(again, 4)
-        face, bary, coarse = kids[chosen], kid_bary[chosen], fine[:, chosen]
+        face, bary, coarse = kids[chosen], kid_bary[chosen], fine[:, :, chosen]
         if not len(face):
             break
     add(face, coarse)

@@ -68,7 +68,7 @@ class JobRows:
             dark_variance=np.zeros_like(own.dark_variance),
             noise_per_signal=noise_per_signal(value, variance, own.spot_pairs.distance).astype(np.float32),
             oblique=np.zeros_like(own.oblique),
-            direction_bias=np.zeros_like(own.direction_bias),
+            tilt=np.zeros_like(own.tilt),
             glow=(),
         )
         model, smooth = reconstruct(samples, self.method), Boundary(own.eta)

@@ -18,16 +18,18 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg
+from scipy.stats import chi2
 
 from hw.base.arrays import F32, F64, Bool
 from pipeline.geometry.mesh import RayMesh
 from pipeline.model.reflectance import GlobalTerm
-from pipeline.model.relightable import RelightableModel
+from pipeline.model.relightable import WITHOUT, RelightableModel
+from pipeline.model.tilt import TiltLaw
 from pipeline.reconstruct.global_term.boundary_fit import measure_boundary, of_mean_one
 from pipeline.reconstruct.global_term.harmonics import Harmonics, harmonics
-from pipeline.reconstruct.global_term.radial_profile import DirectionBias, LaserSamples, fit_profile
+from pipeline.reconstruct.global_term.radial_profile import TILT_EDGES, LaserSamples, ProfileFit, fit_profile
 from pipeline.reconstruct.samples.samples import ANGULAR, Samples, SpotSumImage
-from pipeline.reconstruct.samples.spots import forward_component
+from pipeline.reconstruct.samples.spots import tilts
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +41,7 @@ ROUNDS = 2  # of Gauss-Newton, for each of as many fits of the profile
 TOLERANCE = 1e-3  # of conjugate gradients: what is left stays below the stated errors (docs/decisions/0083)
 MOST_STEPS = 300
 MOST_HARMONICS = 500
+TILT_BY_CHANCE = 1e-3  # probability with which samples without a tilt show one
 
 
 def deviation(edges: F64) -> F64:
@@ -102,12 +105,14 @@ class Fit:
     """One laser's smooth model.
 
     entries: (V, V) R_d, symmetric and positive; at_spots: (S, V) the same between beams and vertices; both in mm^-2,
-    means over all directions; direction_bias: how single directions depart from them; field: (n, n) Y
+    means over all directions; tilt: how single directions depart from them; tilt_chi2: its slopes' squares by their
+    covariance; field: (n, n) Y
     """
 
     entries: F64
     at_spots: F64
-    direction_bias: DirectionBias
+    tilt: TiltLaw
+    tilt_chi2: float
     field: F32
 
 
@@ -115,20 +120,22 @@ def fit_laser(samples: Samples, laser: int, field: SymmetricField, start: F32) -
     """The profile and the field in turn. start: (n, n) first guess of Y, the laser's before."""
     pairs, vertex_pairs, measured = samples.spot_pairs, samples.vertex_pairs, LaserSamples.of(samples, laser)
     edge = samples.edge
-    scale, y, profile = deviation(measured.edges), start, None
+    scale, y = deviation(measured.edges), start
+    found: ProfileFit | None = None
     smooth = scale * field.at_spots(y)
     for _ in range(ROUNDS):
-        profile, direction_bias = fit_profile(pairs, measured, edge, samples.direction_bias, smooth, profile)
-        prior, leaning = pairs.mean(profile), direction_bias(pairs.distance) * samples.direction_bias
+        found = fit_profile(pairs, measured, edge, samples.tilt, smooth, None if found is None else found.profile)
+        prior = pairs.mean(found.profile) * found.tilt.factor(pairs.distance, samples.tilt)
         for _ in range(ROUNDS):
-            relative, weight = measured.residual(prior * np.exp(smooth + leaning))
+            relative, weight = measured.residual(prior * np.exp(smooth))
             y = field.solve(relative + smooth, weight, scale, y)
             smooth = scale * field.at_spots(y)
-    profile, direction_bias = fit_profile(pairs, measured, edge, samples.direction_bias, smooth, profile)
-    kernel = vertex_pairs.mean(profile)
+    found = fit_profile(pairs, measured, edge, samples.tilt, smooth, None if found is None else found.profile)
+    kernel = vertex_pairs.mean(found.profile)
     exponent = deviation(vertex_pairs.distance / edge) * (field.vertices @ y @ field.vertices.T)
     entries = 0.5 * (kernel + kernel.T) * np.exp(0.5 * (exponent + exponent.T))
-    return Fit(entries, pairs.mean(profile) * np.exp(smooth), direction_bias, y)
+    known = float(found.tilt.slope @ np.linalg.solve(found.covariance, found.tilt.slope))
+    return Fit(entries, pairs.mean(found.profile) * np.exp(smooth), found.tilt, known, y)
 
 
 def hold_measured(
@@ -150,7 +157,7 @@ def hold_measured(
     entries, variances = [], []
     for laser, fit in enumerate(fits):
         measured = LaserSamples.of(samples, laser)
-        expected = fit.at_spots * np.exp(fit.direction_bias(samples.spot_pairs.distance) * samples.direction_bias)
+        expected = fit.at_spots * fit.tilt.factor(samples.spot_pairs.distance, samples.tilt)
         variance = measured.variance(expected)
         weight = np.where(measured.observed, 1.0 / (variance + ANGULAR**2), 0.0)
         ratio = share @ (weight * np.where(measured.observed, measured.value / expected, 0.0))
@@ -210,11 +217,22 @@ def complete(samples: Samples) -> RelightableModel:
     )
 
     def expected(view: SpotSumImage) -> F64:
-        direction_bias = sum(forward_component(samples.mesh, samples.spots, view.camera.position))
+        leaving, entering = tilts(samples.mesh, samples.spots, view.camera.position, samples.eta)
+        tilt = leaving + entering
         distance = samples.spot_pairs.distance
-        return np.stack([fit.at_spots * np.exp(fit.direction_bias(distance) * direction_bias) for fit in fits])
+        return np.stack([fit.at_spots * fit.tilt.factor(distance, tilt) for fit in fits])
 
     variance = (reflectance**2 * (relative + BOTH_ENDS)).astype(np.float32)
     measured_ratio = measure_boundary(samples.mesh, samples.eta, samples.glow, expected)
     boundary = of_mean_one(measured_ratio, samples, np.stack([fit.at_spots for fit in fits]))
-    return RelightableModel(samples.mesh, boundary, (GlobalTerm(reflectance.astype(np.float32), measured, variance),))
+    limit = float(chi2.ppf(1 - TILT_BY_CHANCE, len(TILT_EDGES)))
+    tilted = max(fit.tilt_chi2 for fit in fits) > limit
+    term = GlobalTerm(
+        reflectance.astype(np.float32),
+        measured,
+        variance,
+        np.stack([fit.tilt.slope for fit in fits]) if tilted else None,
+        fits[0].tilt.distance if tilted else None,
+    )
+    why = f"samples show no change with direction beyond their noise (chi^2 at most {limit:.0f})"
+    return RelightableModel(samples.mesh, boundary, (term,), {} if tilted else {f"{WITHOUT}angular moments": why})

@@ -16,6 +16,7 @@ from scipy.linalg import block_diag
 
 from hw.base.arrays import F64, Bool
 from pipeline.calibrate.least_squares import Linearised, Prior
+from pipeline.model.tilt import TiltLaw
 from pipeline.reconstruct.samples.distances import Pairs
 from pipeline.reconstruct.samples.samples import ANGULAR, Samples
 
@@ -24,7 +25,7 @@ SCATTER_EDGES = 3.0
 OUTLIER = 3.0  # standard deviations from which on a value counts less (Huber)
 LARGEST_STEP = 2.0  # relative: what lies further from its expectation is taken to lie here
 ITERATIONS = 12
-BIAS_EDGES = (0.5, 2.0, 4.5, 10.0)
+TILT_EDGES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # where the tilt's slopes stand
 ENOUGH = 3e-3  # change of log f at which the fit ends
 
 
@@ -117,71 +118,64 @@ def _start(profile: Profile, measured: LaserSamples, distance: F64) -> F64:
 
 
 @dataclass(frozen=True)
-class DirectionBias:
-    """log R_d seen in a direction is that over all directions + slope(distance) * `forward_component`.
+class ProfileFit:
+    """profile: f; tilt: how single directions depart from it; covariance: (K, K) of the tilt's slopes"""
 
-    Light that has not lost its direction leaves ahead: more is seen along its way than against it, and on a convex
-    object cameras look against it. `slopes` are at BIAS_EDGES edges of length `edge` (mm), linear in log distance.
-    """
-
-    edge: float
-    slopes: F64
-
-    @staticmethod
-    def basis(distance: F64, edge: float) -> F64:
-        """(..., 4) hat functions of log distance."""
-        knots = np.log(edge * np.array(BIAS_EDGES))
-        at = np.log(np.maximum(distance, 0.1 * edge))
-        return np.stack([np.interp(at, knots, one) for one in np.eye(len(knots))], axis=-1)
-
-    def __call__(self, distance: F64) -> F64:
-        """The slope at distances in mm."""
-        return np.asarray(self.basis(distance, self.edge) @ self.slopes)
+    profile: Profile
+    tilt: TiltLaw
+    covariance: F64
 
 
 def fit_profile(
     pairs: Pairs,
     measured: LaserSamples,
     edge: float,
-    direction_bias: F64,
+    tilt: F64,
     offset: F64 | float = 0.0,
     start: Profile | None = None,
-) -> tuple[Profile, DirectionBias]:
-    """Fit f and the bias's slopes so that exp(offset + slope * bias) * (mean of f over the patches) meets the values.
+) -> ProfileFit:
+    """Fit f and the tilt's slopes so that exp(offset) (1 + s tilt) (mean of f over the patches) meets the values.
 
-    direction_bias: (S, V) of the samples; offset: (S, V) or 0; start: a first guess. f is the mean over all directions.
+    tilt: (S, V) of the samples; offset: (S, V) or 0; start: a first guess. f is the mean over all directions.
     """
     knots = _knots(edge, float(pairs.distance.max()) * 1.01)
     profile = start or Profile(knots, _start(Profile(knots, np.zeros(len(knots) - 4)), measured, pairs.distance))
     near_basis, basis = profile.basis(pairs.centres), profile.basis(pairs.distance)
     n = basis.shape[2]
-    leaning = DirectionBias.basis(pairs.distance, edge) * direction_bias[:, :, None]
-    slopes = np.zeros(leaning.shape[2])
-    bend = np.diff(np.eye(n), 2, axis=0)
-    prior = Prior(np.zeros(n + len(slopes)), block_diag(bend.T @ bend, np.eye(len(slopes))))
+    law = TiltLaw(edge * np.array(TILT_EDGES), np.zeros(len(TILT_EDGES)))
+    leaning = law.basis(pairs.distance, law.distance) * tilt[:, :, None]
+    prior = Prior(np.zeros(n + len(law.slope)), block_diag(_bend(n), _bend(len(law.slope))))
     for _ in range(ITERATIONS):
-        expected = pairs.mean(profile)
+        expected, factor = pairs.mean(profile), law.factor(pairs.distance, tilt)
         jacobian = basis.copy()
         slope = pairs.histogram @ (profile(pairs.centres)[:, None] * near_basis)
         jacobian[pairs.first, pairs.second] = slope / expected[pairs.first, pairs.second][:, None]
-        relative, weight = measured.residual(expected * np.exp(offset + leaning @ slopes))
-        flat, w = np.concatenate([jacobian, leaning], axis=2).reshape(-1, n + len(slopes)), weight.ravel()
-        now = np.concatenate([profile.coefficients, slopes])
-        step = Linearised(now, -relative.ravel(), flat, w, prior).step()
+        relative, weight = measured.residual(expected * np.exp(offset) * factor)
+        flat = np.concatenate([jacobian, leaning], axis=2).reshape(-1, n + len(law.slope))
+        now = np.concatenate([profile.coefficients, law.slope])
+        linear = Linearised(now, -relative.ravel(), flat, weight.ravel(), prior)
+        step = linear.step()
         step *= min(1.0, 2.0 / np.abs(step).max())
-        profile, slopes = Profile(knots, now[:n] + step[:n]), now[n:] + step[n:]
+        profile, law = Profile(knots, now[:n] + step[:n]), replace(law, slope=now[n:] + step[n:])
         if np.abs(step).max() < ENOUGH:
             break
-    return profile, DirectionBias(edge, slopes)
+    # A spot's samples err together: where it lies, the object around it.
+    spot = np.repeat(np.arange(len(pairs.distance)), pairs.distance.shape[1])
+    covariance = linear.covariance @ (linear.scatter(spot) + prior.precision) @ linear.covariance
+    return ProfileFit(profile, law, covariance[n:, n:])
+
+
+def _bend(n: int) -> F64:
+    """(n, n) precision of second differences of unit variance."""
+    second = np.diff(np.eye(n), 2, axis=0)
+    return np.asarray(second.T @ second)
 
 
 def over_directions(samples: Samples, laser: int) -> tuple[LaserSamples, Profile]:
-    """One laser's samples with the direction's factor taken out, and the profile: what the simple models are fitted to.
+    """One laser's samples with the tilt taken out, and the profile: what the simple models are fitted to.
 
     They have no directions; a mean over those that the cameras happened to look from would be too low.
     """
-    measured = LaserSamples.of(samples, laser)
-    profile, direction_bias = fit_profile(samples.spot_pairs, measured, samples.edge, samples.direction_bias)
-    return replace(
-        measured, value=measured.value * np.exp(-direction_bias(samples.spot_pairs.distance) * samples.direction_bias)
-    ), profile
+    measured, distance = LaserSamples.of(samples, laser), samples.spot_pairs.distance
+    fit = fit_profile(samples.spot_pairs, measured, samples.edge, samples.tilt)
+    return replace(measured, value=measured.value / fit.tilt.factor(distance, samples.tilt)), fit.profile

@@ -22,7 +22,7 @@ from pipeline.plan.plan import Plan
 from pipeline.reconstruct.samples.distances import Pairs, beam_footprints, spot_pairs, vertex_pairs
 from pipeline.reconstruct.samples.image_operators import ImageOperator
 from pipeline.reconstruct.samples.resample import BatchResult, Sums, ViewReader, look_up, resample
-from pipeline.reconstruct.samples.spots import Spots, forward_component, locate_spots
+from pipeline.reconstruct.samples.spots import Spots, locate_spots, tilts
 from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.stream.stream import StreamReader
 
@@ -50,7 +50,7 @@ class Samples:
     values: (L, S, V) mm^-2, NaN where not observed; averaged over the hat function of the vertex and over the beam
     dark_variance, noise_per_signal: (L, S, V); an entry of expectation m has variance dark + per_signal * m
     oblique: (S, V) relative variance that obliqueness adds at both ends (`oblique_variance`)
-    direction_bias: (S, V) sum of `forward_component` at both ends, mean over the cameras
+    tilt: (S, V) sum of `tilts` at both ends, mean over the cameras
     cosine: (S, V) between normal and direction to the camera, mean over the cameras; 0 where not observed
     glow: per view, images summed over its spots
     """
@@ -62,7 +62,7 @@ class Samples:
     dark_variance: F32
     noise_per_signal: F32
     oblique: F32
-    direction_bias: F64
+    tilt: F64
     cosine: F32
     glow: tuple[SpotSumImage, ...] = ()
 
@@ -199,12 +199,12 @@ class _Gathered:
         Precision is that expected at the entry: noise, scatter between directions, obliqueness of the view.
         """
         shape = self.value.shape[1:]
-        share, oblique, direction_bias, cosine = (np.zeros(shape, np.float32) for _ in range(4))
+        share, oblique, tilt, cosine = (np.zeros(shape, np.float32) for _ in range(4))
         for view, reading in enumerate(self.readings):
             at = self.block(view)
             share[at], oblique[at], cosine[at] = reading.share, oblique_variance(reading.cosine), reading.cosine
-            at_vertices, at_spots = forward_component(mesh, spots, glow[view].camera.position)
-            direction_bias[at] = (at_vertices + at_spots)[at[0]]
+            leaving, entering = tilts(mesh, spots, glow[view].camera.position, eta)
+            tilt[at] = (leaving + entering)[at[0]]
         dark, slope = self.dark_variance(), self.noise_per_signal()
         distance = np.linalg.norm(spots.position[:, None] - np.asarray(mesh.vertices), axis=2)
         expected = self.expected(distance)[:, :, None]
@@ -224,7 +224,7 @@ class _Gathered:
             (weight**2 * dark).sum(axis=2).astype(np.float32),
             (weight**2 * slope).sum(axis=2).astype(np.float32),
             (incidence[:, None] + (common * oblique).sum(axis=1)).astype(np.float32),
-            (common * direction_bias).sum(axis=1).astype(np.float64),
+            (common * tilt).sum(axis=1).astype(np.float64),
             (common * cosine).sum(axis=1).astype(np.float32),
             glow,
         )

@@ -14,9 +14,9 @@ from pipeline.geometry.camera import PinholeCamera
 from pipeline.reconstruct.samples.samples import Samples, SpotSumImage
 from pipeline.reconstruct.samples.spots import Spots
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 UNITS = {
-    "values": "mm^-2", "dark_variance": "mm^-4", "noise_per_signal": "mm^-2", "oblique": "1", "direction_bias": "1",
+    "values": "mm^-2", "dark_variance": "mm^-4", "noise_per_signal": "mm^-2", "oblique": "1", "tilt": "1",
     "cosine": "1", "position": "mm", "direction": "1", "normal": "1", "triangle": "1", "barycentric": "1",
     "transmitted": "1", "vertices": "mm", "faces": "1", "vertex_normals": "1",
 }  # fmt: skip

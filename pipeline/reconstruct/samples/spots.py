@@ -9,7 +9,7 @@ import trimesh
 
 from hw.base.arrays import F64, I64
 from pipeline.calibrate.calibration import Calibration
-from pipeline.geometry.fresnel import transmittance
+from pipeline.geometry.fresnel import along_surface, transmittance
 from pipeline.geometry.mesh import RayMesh
 from pipeline.plan.plan import Plan
 from pipeline.reconstruct.settings import ReconstructConfig
@@ -47,20 +47,15 @@ def locate_spots(mesh: trimesh.Trimesh, calibration: Calibration, plan: Plan, se
     return Spots(position, direction, normal, triangle, barycentric, transmitted, radius)
 
 
-def forward_component(mesh: trimesh.Trimesh, spots: Spots, eye: F64) -> tuple[F64, F64]:
-    """How much one looks along the light's way: (S, V) at the vertices for a camera at `eye`, (S, V) at the spots.
-
-    At a vertex: component of the direction to the camera along the tangent that points away from the spot. At a spot,
-    the same with the roles exchanged: component of the direction to the laser along the tangent away from the vertex.
+def tilts(mesh: trimesh.Trimesh, spots: Spots, eye: F64, eta: float) -> tuple[F64, F64]:
+    """(t . e) of `pipeline.model.tilt` between spots and vertices, looked at from `eye`: (S, V) where light leaves, at
+    the vertices, and (S, V) where it enters, at the spots.
     """
     points, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
     way = points[None] - spots.position[:, None]
-
-    def along(tangent_of: F64, normal: F64, towards: F64) -> F64:
-        tangent = tangent_of - (tangent_of * normal).sum(axis=2, keepdims=True) * normal
-        length = np.maximum(np.linalg.norm(tangent, axis=2), 1e-9)
-        return np.asarray((tangent * towards).sum(axis=2) / length)
-
+    way /= np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-9)
     to_eye = eye - points
     to_eye /= np.linalg.norm(to_eye, axis=1, keepdims=True)
-    return along(way, normals[None], to_eye[None]), along(-way, spots.normal[:, None], -spots.direction[:, None])
+    leaving = along_surface(to_eye, normals, eta)
+    entering = along_surface(spots.direction, spots.normal, eta)
+    return np.einsum("svx,vx->sv", way, leaving), np.einsum("svx,sx->sv", way, entering)

@@ -186,7 +186,7 @@ def test_samples_are_read_back(captured, result, tmp_path: Path) -> None:  # typ
     work, _ = result
     samples, _ = samples_of(folder, read_scan(folder / "scan.ply"), footprint_reading)
     again = load_samples(work / "samples.npz")
-    for name in ("values", "dark_variance", "noise_per_signal", "oblique", "direction_bias"):
+    for name in ("values", "dark_variance", "noise_per_signal", "oblique", "tilt"):
         np.testing.assert_array_equal(getattr(again, name), getattr(samples, name))
     model = reconstruct(again, "default")
     model.save(tmp_path / "again.npz")

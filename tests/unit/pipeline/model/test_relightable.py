@@ -192,8 +192,8 @@ def test_a_lights_radiosity_serves_all_views(monkeypatch: pytest.MonkeyPatch) ->
     for light in lights:
         for _ in range(2):
             of.image(light, of.seen_by(CAMERA))
-    assert drawn[0] is drawn[1]
-    assert drawn[2] is drawn[3]
+    assert np.shares_memory(drawn[0], drawn[1])
+    assert np.shares_memory(drawn[2], drawn[3])
     for radiosity, light in zip(drawn[::2], lights, strict=True):
         expected = np.einsum("lu,luv->lv", light.flux, of.terms[0].reflectance)
         np.testing.assert_allclose(radiosity, expected, rtol=1e-12)

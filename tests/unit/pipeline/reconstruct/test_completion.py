@@ -25,7 +25,7 @@ from pipeline.reconstruct.global_term.harmonics import harmonics
 from pipeline.reconstruct.methods import reconstruct
 from pipeline.reconstruct.omissions import colour_groups, is_opaque
 from pipeline.reconstruct.samples.samples import Samples
-from pipeline.reconstruct.samples.spots import forward_component
+from pipeline.reconstruct.samples.spots import tilts
 
 
 @pytest.fixture(scope="module")
@@ -96,15 +96,10 @@ def spots_on_vertices(made: Synthetic, rng: np.random.Generator) -> tuple[Sample
     values = (s.values * np.exp(0.4 * rng.choice([-1, 0, 1], s.values.shape))).astype(np.float32)
     values[:, transmitted == 0] = np.nan
     none = np.zeros_like(values)
-    direction_bias = rng.uniform(-0.8, 0.2, s.values[0].shape)
-    values = values * np.exp(0.3 * direction_bias).astype(np.float32)
-    return (
-        replace(
-            s, spots=spots, values=values, dark_variance=none, noise_per_signal=none, direction_bias=direction_bias
-        ),
-        first,
-        lit[first],
-    )
+    tilt = rng.uniform(-0.8, 0.2, s.values[0].shape)
+    values = values * (1 + 0.3 * tilt).astype(np.float32)
+    seen = replace(s, spots=spots, values=values, dark_variance=none, noise_per_signal=none, tilt=tilt)
+    return seen, first, lit[first]
 
 
 def test_measured_entries_hold_the_samples() -> None:
@@ -117,8 +112,8 @@ def test_measured_entries_hold_the_samples() -> None:
     model = complete(s).terms[0]
     smooth = SymmetricField.of(harmonics(s.mesh, 500), s.lit, RANGE_EDGES * float(s.mesh.edges_unique_length.mean()))
     fit = fit_laser(s, 0, smooth, np.zeros_like(smooth.penalty))
-    expected = fit.at_spots * np.exp(fit.direction_bias(s.spot_pairs.distance) * s.direction_bias)
-    assert np.abs(fit.direction_bias(np.array([1.0, 3.0])) * 0.5).max() > 0.05  # the samples' tilt was seen
+    expected = fit.at_spots * fit.tilt.factor(s.spot_pairs.distance, s.tilt)
+    assert np.abs(fit.tilt(np.array([1.0, 3.0])) * 0.5).max() > 0.05  # the samples' tilt was seen
     observed = np.isfinite(s.values[0])
     by_one_spot = np.zeros_like(model.measured)
     checked = 0
@@ -145,7 +140,7 @@ def test_noise_decides_between_sample_and_fill() -> None:
     fit = fit_laser(s, 0, smooth, np.zeros_like(smooth.penalty))
     one, left = np.ones_like(fit.entries), np.full_like(fit.entries, 0.09)
     sure, nothing, measured = hold_measured(s, [fit], one, left)
-    expected = fit.at_spots * np.exp(fit.direction_bias(s.spot_pairs.distance) * s.direction_bias)
+    expected = fit.at_spots * fit.tilt.factor(s.spot_pairs.distance, s.tilt)
     noisy = replace(s, dark_variance=(0.09 * expected**2)[None].astype(np.float32))
     between, half, again = hold_measured(noisy, [fit], one, left)
     np.testing.assert_array_equal(measured, again)
@@ -180,12 +175,12 @@ def test_the_boundary_is_compared_with_what_each_view_expects(monkeypatch: pytes
     ((_, _, _, expected),) = asked
     eyes = [np.array([300.0, 0, 0]), np.array([0, 0, -300.0])]
     views = [expected(SimpleNamespace(camera=SimpleNamespace(position=eye)))[0] for eye in eyes]
-    lean = [sum(forward_component(s.mesh, s.spots, eye)) for eye in eyes]
-    ratio, difference = np.log(views[0] / views[1]), lean[0] - lean[1]
+    lean = [sum(tilts(s.mesh, s.spots, eye, s.eta)) for eye in eyes]
     smooth = SymmetricField.of(harmonics(s.mesh, 500), s.lit, RANGE_EDGES * float(s.mesh.edges_unique_length.mean()))
-    slope = fit_laser(s, 0, smooth, np.zeros_like(smooth.penalty)).direction_bias(s.spot_pairs.distance)
-    assert np.abs(slope * difference).max() > 0.1
-    np.testing.assert_allclose(ratio, slope * difference, atol=1e-5)
+    tilt = fit_laser(s, 0, smooth, np.zeros_like(smooth.penalty)).tilt
+    factors = [tilt.factor(s.spot_pairs.distance, one) for one in lean]
+    assert np.abs(factors[0] - factors[1]).max() > 0.1
+    np.testing.assert_allclose(views[0] / views[1], factors[0] / factors[1], rtol=1e-5)
 
 
 def test_size_does_not_matter(small: Synthetic, completed: GlobalTerm) -> None:

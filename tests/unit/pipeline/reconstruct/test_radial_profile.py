@@ -9,22 +9,19 @@ import pytest
 from reconstruct_synthetic import Synthetic, make, rmse_log10
 
 from pipeline.geometry.mesh import RayMesh
+from pipeline.model.tilt import TiltLaw
 from pipeline.reconstruct.baselines.dipole import dipole_reflectance, fit_dipole, fit_dipole_laser
 from pipeline.reconstruct.baselines.lambertian import fit_lambertian
-from pipeline.reconstruct.global_term.completion import (
-    deviation,
-)
-from pipeline.reconstruct.global_term.radial_profile import LaserSamples, fit_profile, scatter
-from pipeline.reconstruct.samples.spots import forward_component
+from pipeline.reconstruct.global_term.completion import complete, deviation
+from pipeline.reconstruct.global_term.radial_profile import TILT_EDGES, LaserSamples, fit_profile, scatter
+from pipeline.reconstruct.samples.spots import tilts
 
 
 def test_profile_is_recovered() -> None:
     made = make(noise=0.0, contrast=0.0, hidden=0.0)
     s = made.samples
-    profile, _ = fit_profile(
-        s.spot_pairs, LaserSamples.of(s, 0), float(s.mesh.edges_unique_length.mean()), s.direction_bias
-    )
-    got = s.vertex_pairs.mean(profile)
+    found = fit_profile(s.spot_pairs, LaserSamples.of(s, 0), s.edge, s.tilt)
+    got = s.vertex_pairs.mean(found.profile)
     assert rmse_log10(0.5 * (got + got.T), made.truth[0]) < 0.02
 
 
@@ -78,10 +75,8 @@ def test_lambertian_albedo_is_the_energy_of_the_spots(small: Synthetic) -> None:
 def test_baselines_are_not_misled_by_the_views(small: Synthetic) -> None:
     """Rationale: samples darker by the direction that they were seen from; the fits see through it."""
     s = make(spots=60, noise=0.0, contrast=0.0).samples
-    direction_bias = np.random.default_rng(4).uniform(-0.8, 0.2, s.values[0].shape)
-    leaning = replace(
-        s, direction_bias=direction_bias, values=s.values * np.exp(0.5 * direction_bias).astype(np.float32)
-    )
+    tilt = np.random.default_rng(4).uniform(-0.8, 0.2, s.values[0].shape)
+    leaning = replace(s, tilt=tilt, values=s.values * (1 + 0.5 * tilt).astype(np.float32))
     np.testing.assert_allclose(
         fit_lambertian(leaning).terms[0].albedo.mean(), fit_lambertian(s).terms[0].albedo.mean(), rtol=0.02
     )
@@ -92,12 +87,11 @@ def test_profile_is_that_of_all_directions() -> None:
     """Rationale: samples brighter where one looks along the light's way; the tilted fit takes it out again."""
     made = make(noise=0.0, contrast=0.0, hidden=0.0)
     s = made.samples
-    direction_bias = np.random.default_rng(4).uniform(-0.8, 0.2, s.values[0].shape)
-    edge = float(s.mesh.edges_unique_length.mean())
-    seen = LaserSamples.of(replace(s, values=s.values * np.exp(0.5 * direction_bias).astype(np.float32)), 0)
+    tilt = np.random.default_rng(4).uniform(-0.8, 0.2, s.values[0].shape)
+    seen = LaserSamples.of(replace(s, values=s.values * (1 + 0.5 * tilt).astype(np.float32)), 0)
     plain, tilted = (
-        s.vertex_pairs.mean(fit_profile(s.spot_pairs, seen, edge, t)[0]).sum() / made.truth[0].sum()
-        for t in (np.zeros_like(direction_bias), direction_bias)
+        s.vertex_pairs.mean(fit_profile(s.spot_pairs, seen, s.edge, t).profile).sum() / made.truth[0].sum()
+        for t in (np.zeros_like(tilt), tilt)
     )
     assert plain < 0.9
     assert tilted == pytest.approx(1.0, abs=0.01)
@@ -112,9 +106,38 @@ def test_tilt_has_the_sign_of_the_view() -> None:
         normal=np.array([[0, 0, 1.0]] * 2),
         direction=np.array([[0, 0, -1.0], [-0.6, 0, -0.8]]),  # the second laser stands on the +x side
     )
-    at_vertices, at_spots = forward_component(s.mesh, pole, np.array([1e6, 0, 0]))
+    at_vertices, at_spots = tilts(s.mesh, pole, np.array([1e6, 0, 0]), 1.3)
     x, _, z = np.asarray(s.mesh.vertices).T
     near = (z > 8) & (np.abs(x) > 2)
     np.testing.assert_array_equal(np.sign(at_vertices[0, near]), np.sign(x[near]))
     np.testing.assert_allclose(at_spots[0, near], 0.0, atol=1e-9)
     np.testing.assert_array_equal(np.sign(at_spots[1, near]), -np.sign(x[near]))
+
+
+def test_slopes_are_found_with_honest_errors() -> None:
+    """Rationale: samples with a known law and known noise, forty times. Expected: z of the slopes about 1, no bias."""
+    made = make(spots=60, noise=0.0, contrast=0.0, hidden=0.2)
+    s, rng, z = made.samples, np.random.default_rng(3), []
+    tilt = rng.uniform(-0.7, 0.4, s.values[0].shape)
+    law = TiltLaw(s.edge * np.array(TILT_EDGES), np.array([0.1, 0.3, 0.6, 0.55, 0.4, 0.2, 0.1]))
+    exact = s.values * law.factor(s.spot_pairs.distance, tilt)
+    for _ in range(40):
+        noisy = exact * (1 + 0.1 * rng.standard_normal(exact.shape))
+        seen = replace(s, tilt=tilt, values=noisy.astype(np.float32), noise_per_signal=(0.01 * np.nan_to_num(exact)))
+        found = fit_profile(s.spot_pairs, LaserSamples.of(seen, 0), s.edge, tilt)
+        z.append((found.tilt.slope - law.slope) / np.sqrt(np.diag(found.covariance)))
+    inner = np.array(z)[:, 1:-1]  # the profile's ends are not where the prior says
+    assert np.abs(inner.mean(axis=0)).max() < 4 * 1.2 / np.sqrt(40)
+    assert 0.7 < np.sqrt((inner**2).mean()) < 1.3
+
+
+def test_an_object_without_a_tilt_is_left_alone() -> None:
+    """Rationale: samples without an effect of direction, with noise, among views that lean to all sides."""
+    s = make(spots=60, noise=0.05, contrast=0.0).samples
+    tilt = np.random.default_rng(4).uniform(-0.7, 0.4, s.values[0].shape)
+    model = complete(replace(s, tilt=tilt))
+    assert model.terms[0].tilt is None
+    assert "no change with direction" in model.provenance["without angular moments"]
+    leaning = replace(s, tilt=tilt, values=s.values * (1 + 0.3 * tilt).astype(np.float32))
+    (term,) = complete(leaning).terms
+    np.testing.assert_allclose(term.tilt[0, 1:5], 0.3, atol=0.1)

@@ -78,13 +78,14 @@ def test_tilt_is_that_of_both_ends() -> None:
     eye, points, normals = rig().cameras[0], np.asarray(s.mesh.vertices), np.asarray(s.mesh.vertex_normals)
     position = np.array(eye.position_mm)
     for v in (3, 10, 20):
-        out = points[v] - s.spots.position[0]
-        tangent = out - normals[v] * (out @ normals[v])
+        way = points[v] - s.spots.position[0]
+        way /= np.linalg.norm(way)
         look = (position - points[v]) / np.linalg.norm(position - points[v])
-        back = -out - s.spots.normal[0] * (-out @ s.spots.normal[0])
-        there = look @ tangent / np.linalg.norm(tangent)
-        here = -s.spots.direction[0] @ back / np.linalg.norm(back)
-        assert s.direction_bias[0, v] == pytest.approx(there + here, abs=1e-5)
+        there = (look - normals[v] * (look @ normals[v])) @ way / s.eta
+        down, normal = s.spots.direction[0], s.spots.normal[0]
+        here = (down - normal * (down @ normal)) @ way / s.eta
+        assert s.tilt[0, v] == pytest.approx(there + here, abs=1e-5)
+        assert abs(there) > 0.01 or abs(here) > 0.01
 
 
 def test_expectation_follows_a_steep_kernel() -> None:
