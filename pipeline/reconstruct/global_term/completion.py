@@ -28,6 +28,7 @@ from pipeline.model.tilt import TiltLaw
 from pipeline.reconstruct.global_term.boundary_fit import measure_boundary, of_mean_one
 from pipeline.reconstruct.global_term.harmonics import Harmonics, harmonics
 from pipeline.reconstruct.global_term.radial_profile import TILT_EDGES, LaserSamples, ProfileFit, fit_profile
+from pipeline.reconstruct.global_term.totals import steady_totals
 from pipeline.reconstruct.samples.samples import ANGULAR, Samples, SpotSumImage
 from pipeline.reconstruct.samples.spots import tilts
 
@@ -222,9 +223,11 @@ def complete(samples: Samples) -> RelightableModel:
         distance = samples.spot_pairs.distance
         return np.stack([fit.at_spots * fit.tilt.factor(distance, tilt) for fit in fits])
 
-    variance = (reflectance**2 * (relative + BOTH_ENDS)).astype(np.float32)
     measured_ratio = measure_boundary(samples.mesh, samples.eta, samples.glow, expected)
     boundary = of_mean_one(measured_ratio, samples, np.stack([fit.at_spots for fit in fits]))
+    area, level = RayMesh.of(samples.mesh).vertex_areas, boundary.mean_transmittance**2
+    reflectance = steady_totals(reflectance, relative, area, level, basis, edge)
+    variance = (reflectance**2 * (relative + BOTH_ENDS)).astype(np.float32)
     limit = float(chi2.ppf(1 - TILT_BY_CHANCE, len(TILT_EDGES)))
     tilted = max(fit.tilt_chi2 for fit in fits) > limit
     term = GlobalTerm(

@@ -1,0 +1,107 @@
+"""Column totals with a prior of their own: broad light sees sums of entries.
+
+Entries that nothing was measured near are off by tens of per cent, and alike within a column: its total may come out
+at twice of what arrives. Totals themselves vary slowly over the surface, and more light than arrives does not leave. So
+the logarithm of every vertex's total is kriged over the surface, each with the deviation that its column states: what
+was measured keeps its total, what was not takes its neighbours'. Then each vertex has one factor, on its row and its
+column alike, so that R_d stays symmetric and its sums meet those totals (docs/decisions/0121).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.stats import norm
+
+from hw.base.arrays import F64
+from pipeline.reconstruct.global_term.harmonics import Harmonics
+
+RANGES = (1.5, 2.5, 4.0, 6.0, 10.0)  # edges: correlation lengths that are tried
+DEVIATIONS = (0.02, 0.04, 0.08, 0.16, 0.32)  # of the totals' logarithms over the surface, likewise
+COMMON = (0.02, 0.04, 0.08)  # what the samples of one spot have in common, likewise
+ENOUGH = 1e-4  # relative change of a factor at which the scaling ends
+STEPS = 200
+
+
+@dataclass(frozen=True)
+class Kriging:
+    """A Gaussian field z = mean + U a, a ~ N(0, diag(spectrum)), observed with (V,) noise variances.
+
+    functions: (V, n) U; spectrum: (n,); noise: (V,)
+    """
+
+    functions: F64
+    spectrum: F64
+    noise: F64
+
+    def posterior(self, observed: F64) -> tuple[F64, F64, float]:
+        """(V,) mean and variance of z given the observations (Rasmussen & Williams 2006, eq. 2.11, 2.12; its mean by
+        generalised least squares), and the logarithm of their likelihood, but for a constant.
+        """
+        weighted = self.functions / self.noise[:, None]
+        factor = cho_factor(self.functions.T @ weighted + np.diag(1.0 / self.spectrum))
+
+        def whitened(x: F64) -> F64:
+            return np.asarray(x / self.noise - weighted @ cho_solve(factor, weighted.T @ x))
+
+        one = np.ones(len(observed))
+        level = float((whitened(one) @ observed) / (whitened(one) @ one))
+        pull = whitened(observed - level)
+        mean = level + self.functions @ (self.spectrum * (self.functions.T @ pull))
+        variance = (self.functions * cho_solve(factor, self.functions.T).T).sum(axis=1)
+        size = 2 * np.log(np.diag(factor[0])).sum() + np.log(self.spectrum).sum() + np.log(self.noise).sum()
+        return np.asarray(mean), np.asarray(variance), float(-0.5 * ((observed - level) @ pull + size))
+
+
+def steady_totals(
+    reflectance: F64, variance: F64, area: F64, exitance_per_flux: float, basis: Harmonics, edge: float
+) -> F64:
+    """(L, V, V) R_d whose column totals are steadied, symmetric as before.
+
+    reflectance: (L, V, V) mm^-2; variance: relative, of what the fill leaves open; area: (V,) mm^2 of the hats;
+    exitance_per_flux: Tbar^2, by which sums of R_d are what leaves of what arrives; edge: mm
+    """
+    share = reflectance * area
+    total = share.sum(axis=2)
+    open_deviation = (share * np.sqrt(variance)).sum(axis=2) / total  # errors of a column are alike: they simply add up
+    known = np.log(total * exitance_per_flux)
+
+    def field(laser: int, choice: tuple[float, float, float]) -> tuple[F64, F64, float]:
+        length, deviation, common = choice
+        spectrum = 1.0 / basis.roughness(length * edge)
+        noise = open_deviation[laser] ** 2 + common**2
+        return Kriging(basis.functions, deviation**2 * spectrum / spectrum.sum(), noise).posterior(known[laser])
+
+    choices = list(product(RANGES, DEVIATIONS, COMMON))
+    middle = len(known) // 2  # one wavelength tells the lengths of all
+    best = choices[int(np.argmax([field(middle, choice)[2] for choice in choices]))]
+    out = np.empty_like(reflectance)
+    for laser, own in enumerate(reflectance):
+        mean, spread, _ = field(laser, best)
+        wanted = np.exp(at_most_zero(mean, np.sqrt(spread))) / exitance_per_flux
+        factor = scaling(own, area, wanted)
+        out[laser] = factor[:, None] * own * factor
+    return out
+
+
+def at_most_zero(mean: F64, deviation: F64) -> F64:
+    """Expectation of a normal variable that is known to be at most 0."""
+    edge = -mean / deviation
+    return np.asarray(mean - deviation * np.exp(norm.logpdf(edge) - norm.logcdf(edge)))
+
+
+def scaling(reflectance: F64, area: F64, wanted: F64) -> F64:
+    """(V,) g for which g_u sum_v R_uv g_v A_v = wanted_u (Sinkhorn and Knopp 1967, for symmetric matrices).
+
+    reflectance: (V, V) symmetric, positive; area, wanted: (V,)
+    """
+    factor = np.ones(len(area))
+    for _ in range(STEPS):
+        change = np.sqrt(wanted / (factor * (reflectance @ (factor * area))))
+        factor *= change
+        if np.abs(change - 1).max() < ENOUGH:
+            break
+    return factor
