@@ -144,7 +144,8 @@ def fit_profile(
     n = basis.shape[2]
     law = TiltLaw(edge * np.array(TILT_EDGES), np.zeros(len(TILT_EDGES)))
     leaning = law.basis(pairs.distance, law.distance) * tilt[:, :, None]
-    prior = Prior(np.zeros(n + len(law.slope)), block_diag(_bend(n), _bend(len(law.slope))))
+    slopes = _bend(len(law.slope)) + np.eye(len(law.slope))  # where nothing leans, they are 0
+    prior = Prior(np.zeros(n + len(law.slope)), block_diag(_bend(n), slopes))
     for _ in range(ITERATIONS):
         expected, factor = pairs.mean(profile), law.factor(pairs.distance, tilt)
         jacobian = basis.copy()
