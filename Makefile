@@ -44,7 +44,7 @@ demo: $(READY)
 
 # The laser's timing alone. Then what waits for devices, in a process of its own that gets a core whenever it wants one,
 # beside what computes, on every core; each worker's linear algebra keeps to one of them.
-DEVICES := tests/unit/hw tests/unit/disco_twin/emulation tests/system/test_rig.py
+DEVICES := tests/unit/hw tests/unit/disco_twin/emulation tests/unit/pipeline/capture/test_loop.py tests/system/test_rig.py
 DEVICE_LOG := $(VENV)/devices.log
 test: $(CLIENTS)
 	@status=0; \

@@ -23,7 +23,9 @@ hypothesis.settings.load_profile("disco-twin")
 
 
 LONGEST_FIRST = ("regression", "validation", "system")  # folders of tests; nobody waits at the end for one long file
-DEVICES = ("unit/hw", "unit/disco_twin/emulation", "system/test_rig.py")  # tests that wait for devices in real time
+DEVICES = (  # tests that wait in real time: for devices, and for the disk
+    "unit/hw", "unit/disco_twin/emulation", "unit/pipeline/capture/test_loop.py", "system/test_rig.py",
+)  # fmt: skip
 
 
 @pytest.hookimpl(tryfirst=True)  # before `-m` chooses by marks
