@@ -147,6 +147,7 @@ def run(capture: Path, work: Path, request: Request, given: Path | None = None) 
         mesh = read_scan(capture / "scan.ply", CAPTURE_AGAIN)
         calibration, calibrated = calibrate(capture, rig, sensor, mesh, given)
         calibration.save(work / "calibration.json")
+        mesh = calibration.calibrated(mesh)
     samples, statistics = gather(capture, calibration, mesh, settings, stages)
     if statistics.coverage == 0:
         raise InputError("no camera sees any spot's surroundings", file=capture, remedy="check the cameras' poses")
@@ -154,7 +155,7 @@ def run(capture: Path, work: Path, request: Request, given: Path | None = None) 
     with stages.stage("distances"):
         shared = samples["footprint"]  # the methods share its distances
         log.info("%d near pairs", len(shared.spot_pairs.first) + len(shared.vertex_pairs.first))
-        left_out = omissions(shared, calibration)
+        left_out = omissions(shared, calibration, calibrated.get("scan", {}).get("left_out"))
     models: dict[str, RelightableModel] = {}
     seconds: dict[str, float] = {}
     for name in settings.methods:

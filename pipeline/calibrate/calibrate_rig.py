@@ -22,6 +22,7 @@ from pipeline.calibrate.calibration import (
     Calibration,
     LaserCalibration,
     ProjectorCalibration,
+    ScanCalibration,
     ViewCalibration,
     pair,
     triple,
@@ -60,7 +61,7 @@ class RigMeasurement:
 
 
 def measure(capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh) -> RigMeasurement:
-    """All stages. `mesh`: the scan, object frame, mm. Raises: DiscoError where the images do not tell a part."""
+    """All stages. `mesh`: the scan as it came, in mm. Raises: DiscoError where the images do not tell a part."""
     response = measure_response(capture, rig, sensor) if rig.sensor.response == "curved" else None
     if response is not None:
         sensor = replace(sensor, response=tuple(float(x) for x in response.exposure))
@@ -71,6 +72,7 @@ def measure(capture: Path, rig: RigConfig, sensor: Sensor, mesh: trimesh.Trimesh
     with StreamReader(capture) as stream:
         stream.require_complete()
         poses = measure_poses(stream, sensor, mesh, cameras, angles)
+        mesh = poses.scan.moved(mesh)
         nominal, place = nominal_projector(rig, [c.lens for c in cameras], poses)
         size = plane_measurement(cameras, poses, nominal)
         fit = measure_projector(stream, rig, sensor, mesh, poses, size, nominal, place)
@@ -244,6 +246,10 @@ def assemble(
         LaserCalibration(wavelength_nm=config.wavelength_nm, power_w=float(w), power_error_w=float(w * s))
         for config, w, s in zip(rig.lasers, watts, scatter, strict=True)
     )
+    scan = None
+    if not poses.scan.because:
+        move, error = (tuple(float(x) for x in values) for values in (poses.scan.displacement, poses.scan.error))
+        scan = ScanCalibration(displacement_mm=move, error_mm=error)
     return Calibration(
-        source="measured", views=tuple(views), projectors=tuple(projectors), lasers=lasers, sensor=sensor
+        source="measured", views=tuple(views), projectors=tuple(projectors), lasers=lasers, sensor=sensor, scan=scan
     )

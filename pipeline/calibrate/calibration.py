@@ -14,14 +14,17 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
+import trimesh
 from pydantic import Field
 
 from hw.base.arrays import F64
 from hw.base.config import Strict, as_table, read_json
+from hw.base.errors import InputError
 from hw.base.files import write_atomically
 from hw.interface import Aim
 from hw.record import RadianceImage, RawImage, Sensor, to_radiance
 from pipeline.geometry.camera import PinholeCamera, Pose, pose_rows, turn
+from pipeline.geometry.mesh import displaced
 from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.geometry.projector import TwoMirrorProjector
 
@@ -95,8 +98,18 @@ class LaserCalibration(Strict):
     power_error_w: Error = None
 
 
+class ScanCalibration(Strict):
+    """By how much the scan is moved along its vertex normals, outward, mm by vertex, and what remains unknown of it."""
+
+    displacement_mm: tuple[float, ...]
+    error_mm: tuple[NotNegative, ...]
+
+
 class Calibration(Strict):
-    """See the module. `vignetting_exponent` n: a pixel seen at angle t off the optical axis receives cos(t)^n."""
+    """See the module. `vignetting_exponent` n: a pixel seen at angle t off the optical axis receives cos(t)^n.
+
+    scan: None where the scan is used as it came
+    """
 
     format_version: Literal[1] = 1
     source: Literal["nominal", "measured"]
@@ -105,6 +118,21 @@ class Calibration(Strict):
     lasers: Annotated[tuple[LaserCalibration, ...], Field(min_length=1)]
     sensor: Annotated[Sensor, as_table(Sensor)]
     vignetting_exponent: float = 4.0
+    scan: ScanCalibration | None = None
+
+    def calibrated(self, scan: trimesh.Trimesh) -> trimesh.Trimesh:
+        """The scan with its vertices where the calibration found them, numbered as before.
+
+        Raises: InputError for a scan of another number of vertices.
+        """
+        if self.scan is None:
+            return scan
+        if len(self.scan.displacement_mm) != len(scan.vertices):
+            raise InputError(
+                "the calibration is of another scan", key="scan.displacement_mm", value=len(scan.vertices),
+                allowed=f"{len(self.scan.displacement_mm)} vertices", remedy="calibrate again, with this scan",
+            )  # fmt: skip
+        return displaced(scan, np.array(self.scan.displacement_mm))
 
     @property
     def n_angles(self) -> int:

@@ -37,6 +37,7 @@ def figures(found: RigMeasurement) -> dict[str, Any]:
             "xor_px": list(found.poses.xor_pixels),
             "ambiguity": list(found.poses.ambiguity),
         },
+        "scan": _scan(found.poses),
         "poses": _poses(found.poses, names),
         "axis": _axis(found.poses),
         "projector": _projector(found.projector),
@@ -81,6 +82,23 @@ def _photometric(found: RigMeasurement, names: Sequence[str]) -> dict[str, Any]:
         "power_w": [laser.power_w for laser in found.calibration.lasers],
         "power_drift": _floats(np.max([b.drift for b in balances], axis=0)),
         "power_scatter": _floats(np.max([b.scatter for b in balances], axis=0)),
+    }
+
+
+def _scan(poses: PoseFit) -> dict[str, Any]:
+    """Of the scan's surface, rms over its vertices: by how much it was moved, and what remains unknown of it.
+
+    chi2: mean square of what the edges leave, over their own error, before and after; left_out: why it was not moved
+    """
+    scan = poses.scan
+    moved, error = (0.0 if scan.because else float(np.sqrt((x**2).mean())) for x in (scan.displacement, scan.error))
+    return {
+        "moved_mm": moved,
+        "error_mm": error,
+        "edge_px": scan.edge_px,
+        "chi2_before": scan.chi2_before,
+        "chi2_after": scan.chi2_after,
+        "left_out": scan.because or None,
     }
 
 

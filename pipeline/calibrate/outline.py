@@ -14,7 +14,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage, special
 
-from hw.base.arrays import F64, Bool
+from hw.base.arrays import F64, I64, Bool
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.mesh import RayMesh
 
@@ -33,6 +33,7 @@ class Outline:
 
     across: (K, 3) the surface's unit normal in the camera's frame; only motion along it moves the outline
     length: (K,) pixels of the outline that each stands for
+    ends: (K, 2) vertices between which each lies; shares: (K, 2) values of their hat functions there
     """
 
     points: F64
@@ -40,6 +41,8 @@ class Outline:
     normal: F64
     across: F64
     length: F64
+    ends: I64
+    shares: F64
 
 
 def outline(mesh: trimesh.Trimesh, camera: PinholeCamera) -> Outline:
@@ -48,24 +51,28 @@ def outline(mesh: trimesh.Trimesh, camera: PinholeCamera) -> Outline:
     front = (mesh.face_normals * towards).sum(axis=1) < 0
     pairs, edges = mesh.face_adjacency, mesh.face_adjacency_edges
     rim = front[pairs[:, 0]] != front[pairs[:, 1]]
-    ends = np.asarray(mesh.vertices)[edges[rim]]  # (E, 2, 3)
+    vertices = np.asarray(edges[rim], np.int64)
+    ends = np.asarray(mesh.vertices)[vertices]  # (E, 2, 3)
     facing = np.where(front[pairs[rim, 0]], pairs[rim, 0], pairs[rim, 1])
     smooth = np.asarray(mesh.vertex_normals)[edges[rim]] @ camera.pose[:3, :3].T  # (E, 2, 3), camera's frame
     sharp = mesh.face_adjacency_angles[rim] > SHARP_RAD
     pixel = np.stack([camera.project(ends[:, k])[0] for k in (0, 1)], axis=1)
     size = np.linalg.norm(pixel[:, 1] - pixel[:, 0], axis=1)
     keep = size > 1e-6
-    ends, facing, pixel, size, smooth, sharp = (x[keep] for x in (ends, facing, pixel, size, smooth, sharp))
+    ends, facing, pixel, size, smooth, sharp, vertices = (
+        x[keep] for x in (ends, facing, pixel, size, smooth, sharp, vertices)
+    )
     parts = np.maximum(np.ceil(size), 1).astype(int)
     index = np.repeat(np.arange(len(parts)), parts)
     share = (np.arange(len(index)) - np.repeat(np.cumsum(parts) - parts, parts) + 0.5) / parts[index]
-    points = ends[index, 0] * (1 - share)[:, None] + ends[index, 1] * share[:, None]
+    shares = np.column_stack([1 - share, share])
+    points = (ends[index] * shares[:, :, None]).sum(axis=1)
     along = (pixel[:, 1] - pixel[:, 0]) / size[:, None]
     normal = np.column_stack([along[:, 1], -along[:, 0]])
     inward = camera.project(np.asarray(mesh.triangles_center)[facing])[0] - pixel.mean(axis=1)
     normal *= -np.sign((normal * inward).sum(axis=1))[:, None]
     # A rim of a finely faceted surface zigzags, the surface's own normal does not.
-    across = _unit(smooth[index, 0] * (1 - share)[:, None] + smooth[index, 1] * share[:, None])
+    across = _unit((smooth[index] * shares[:, :, None]).sum(axis=1))
     at, length = camera.project(points)[0], (size / parts)[index]
     rays = camera.undistort((at - camera.centre) / camera.focal)
     flat = normal[index]  # of the plane through the eye and a sharp edge
@@ -73,7 +80,9 @@ def outline(mesh: trimesh.Trimesh, camera: PinholeCamera) -> Outline:
     across = np.where(sharp[index, None], flat, across)
     normal = _unit(across[:, :2])
     outer = ~RayMesh.of(mesh).meets(*camera.rays(at + CLEAR * normal))
-    return Outline(points[outer], at[outer], normal[outer], across[outer], length[outer])
+    return Outline(
+        points[outer], at[outer], normal[outer], across[outer], length[outer], vertices[index][outer], shares[outer]
+    )
 
 
 def _unit(vectors: F64) -> F64:

@@ -167,6 +167,12 @@ class RayMesh:
         return np.where((smooth * flat).sum(axis=2, keepdims=True) < CREASE, flat, smooth)
 
 
+def displaced(mesh: trimesh.Trimesh, displacement: F64) -> trimesh.Trimesh:
+    """A mesh with its vertices moved along their normals by (V,) mm, outward where positive; numbers stay."""
+    vertices = np.asarray(mesh.vertices) + displacement[:, None] * np.asarray(mesh.vertex_normals)
+    return trimesh.Trimesh(vertices, mesh.faces, process=False)
+
+
 @lru_cache(maxsize=4)  # by the mesh's identity and content: a run asks of its scan and of its object
 def _ray_mesh(mesh: trimesh.Trimesh) -> RayMesh:
     faces = np.array(mesh.faces, np.int64)

@@ -53,11 +53,14 @@ def _equal(values: NDArray[np.float32], variance: NDArray[np.float32]) -> bool:
     return bool(abs(difference) <= SAME_COLOUR * noise + 1e-3 * abs(total) and spread < SAME_COLOUR)
 
 
-def omissions(samples: Samples, calibration: Calibration) -> list[dict[str, str]]:
-    """Rows {what, because} of what the pipeline left out for this capture."""
+def omissions(samples: Samples, calibration: Calibration, scan: str | None = None) -> list[dict[str, str]]:
+    """Rows {what, because} of what was left out for this capture; scan: why that was not fitted to silhouettes."""
     out = []
     if calibration.source == "nominal":
-        out.append(("pose and projector estimation", "the calibration holds the nominal rig's geometry"))
+        nominal = "the calibration holds the nominal rig's geometry"
+        out += [("pose and projector estimation", nominal), ("fitting the scan to silhouettes", nominal)]
+    if scan is not None:
+        out.append(("fitting the scan to silhouettes", scan))
     if not calibration.sensor.response:
         out.append(("response calibration", "the camera's digital numbers are linear by its data sheet"))
     if is_opaque(samples):

@@ -104,6 +104,14 @@ MEASURED: dict[str, Any] = {
         "xor_px": [16, 30],
         "ambiguity": ["rotation about <z>"],
     },
+    "scan": {
+        "moved_mm": 0.0821,
+        "error_mm": 0.0512,
+        "edge_px": 0.027,
+        "chi2_before": 41.2,
+        "chi2_after": 0.81,
+        "left_out": None,
+    },
     "poses": [{"camera": "front", "rotation_error_deg": 0.087, "across_error_mm": 0.43, "depth_error_mm": 0.86}],
     "axis": {
         "tilt_deg": [-0.011, 0.013],
@@ -150,6 +158,8 @@ def test_a_measured_calibration_is_shown_with_its_uncertainty() -> None:
         "between 16 and 30 pixels",
         "0.065 mm, alike over 10 mm",
         "rotation about &lt;z&gt;",
+        "moved by 0.082 mm rms, then known to ± 0.051 mm",
+        "41.2 before, 0.81 after",
         "86 used, 91 hidden, 3 false",
         "± 0.033 mm",
         "0.089 ± 0.033 mm sin(t) + 0.102 ± 0.036 mm sin(t)³",
@@ -164,6 +174,9 @@ def test_the_calibration_shows_only_what_was_found() -> None:
     outline = dict(MEASURED["silhouettes"])
     for unknown in (outline | {"scan_error_alike_mm": 0.0}, {k: outline[k] for k in outline if "alike" not in k}):
         assert "own error</td><td>not known" in calibration_section(MEASURED | {"silhouettes": unknown})
+    left = MEASURED | {"scan": MEASURED["scan"] | {"left_out": "silhouettes and scan agree"}}
+    assert "left as it is</td><td>silhouettes and scan agree" in calibration_section(left)
+    assert "the scan's surface" not in calibration_section({k: v for k, v in MEASURED.items() if k != "scan"})
     for source, reason in (("nominal", "deviation is off"), ("given", "given as a file"), ("other", "No figures")):
         shown = calibration_section({"source": source})
         assert reason in shown

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from hw.base.errors import InputError
 from hw.interface import Aim
 from hw.record import RawImage, Sensor, to_radiance
-from pipeline.calibrate.calibration import Calibration, nominal_calibration
+from pipeline.calibrate.calibration import Calibration, ScanCalibration, nominal_calibration
 from pipeline.geometry.camera import PinholeCamera, turn
 from pipeline.geometry.nominal_rig import CameraConfig, RigConfig
 from pipeline.geometry.projector import TwoMirrorProjector
@@ -58,6 +59,18 @@ def test_view_cameras_and_spot_rays_are_the_nominal_rig_in_the_object_frame(cali
 def test_round_trip_keeps_every_digit(calibration: Calibration, tmp_path: Path) -> None:
     calibration.save(tmp_path / "calibration.json")
     assert Calibration.load(tmp_path / "calibration.json") == calibration
+
+
+def test_a_scan_is_moved_as_it_was_calibrated(calibration: Calibration) -> None:
+    """Along its vertex normals, by vertex; a scan of another number of vertices is refused."""
+    ball = trimesh.creation.icosphere(2, 10.0)
+    assert calibration.calibrated(ball) is ball
+    outward = tuple(0.01 * k for k in range(len(ball.vertices)))
+    moved = calibration.model_copy(update={"scan": ScanCalibration(displacement_mm=outward, error_mm=outward)})
+    distance = np.linalg.norm(moved.calibrated(ball).vertices, axis=1)
+    np.testing.assert_allclose(distance, 10.0 + np.array(outward), atol=1e-3)
+    with pytest.raises(InputError, match="another scan"):
+        moved.calibrated(trimesh.creation.icosphere(1, 10.0))
 
 
 def test_refusals_are_one_line_that_names_the_file(calibration: Calibration, tmp_path: Path) -> None:
