@@ -193,10 +193,11 @@ def _footprint(vertices: F64, spots: Spots, spot: int) -> F64:
 def best_curve(mesh: trimesh.Trimesh, eta: float, seen: Sequence[SeenRadiosity]) -> Boundary:
     """The one curve of the view cosine that explains all these references: an oracle, for floors alone.
 
-    seen: with images in W/(mm^2 sr) and radiosities in W/mm^2; each counts by its own mean, so that all lights count
-    alike
+    seen: with images in W/(mm^2 sr) and radiosities in W/mm^2. Each counts by its own peak. By its mean, a light that
+    leaves most of a view dark would bend the curve where it says least, and the broad lights would lose by it
+    (docs/decisions/0112).
     """
-    scales = [1.0 / max(float(one.image.mean()), 1e-300) for one in seen]
+    scales = [1.0 / max(float(one.image.max()), 1e-300) for one in seen]
     weighed = (
         SeenRadiosity(one.camera, np.pi * scale * one.image, scale * one.radiosity)
         for one, scale in zip(seen, scales, strict=True)
