@@ -1,8 +1,8 @@
-"""References by stock Mitsuba (`volpath`, no roulette): `python -m benchmarks.volpath_references [--minutes 9]`.
+"""References by stock Mitsuba (`volpath`, no roulette): `python -m benchmarks.volpath_references [--most 6]`.
 
 Renders those of `WANTED` that are missing beside their scenes, in passes that are kept in `--work`: a call that is
-stopped, or that ends after `--minutes`, is continued by the next. Afterwards, or with --compare, each is compared with
-our own reference of the same light and view.
+stopped, or that ends after `--most` passes of a half, is continued by the next. Afterwards, or with --compare, each is
+compared with our own reference of the same light and view.
 
 Layers as ours have them: what the surface reflects is the image of the same object with a black inside, what comes from
 below is the image of the object less that. The halves are independent of each other in both.
@@ -11,6 +11,7 @@ below is the image of the object less that. The halves are independent of each o
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import tempfile
 import time
@@ -33,6 +34,7 @@ from disco_twin.experiment.references import (
 from disco_twin.light.references import HALVES, LAYERS, Reference, load_reference, noise_of, save_reference
 from disco_twin.object.build import TwinObject, build_object
 from disco_twin.scene.scene import Scene, load_scene
+from hw.base.arrays import F64
 from hw.base.files import load_arrays, save_arrays
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.nominal_rig import CameraConfig
@@ -43,16 +45,17 @@ PASS = 16  # samples of every pixel in one pass of a half
 BLACK_PASSES = 4  # passes of the black object for each of the object: its paths are short
 BLACK = 100.0  # times sigma_t, of the object that is black inside
 VARIANT = "llvm_ad_rgb"
-VERSION = 1  # of the file that holds passes
+VERSION = 2  # of the file that holds passes
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """References under a light of a scene, in all of its held-out views, of so many passes a half."""
+    """References under a light of a scene, in some of its held-out views, of so many passes a half."""
 
     scene: str
     light: str
     passes: int
+    views: tuple[str, ...] = ("left", "right")
 
     @property
     def file(self) -> Path:
@@ -62,6 +65,8 @@ class Wanted:
 WANTED = (
     Wanted("accuracy/score/bracket.toml", "uniform", 12),
     Wanted("accuracy/score/bracket.toml", "environment", 48),
+    Wanted("quick.toml", "uniform", 3),
+    Wanted("quick.toml", "environment", 1, ("left",)),
 )
 
 
@@ -97,6 +102,25 @@ class Job:
         return load_reference(reference_path(self.folder, self.light, self.view))
 
 
+@dataclass
+class Passes:
+    """What has been rendered of a job: sums (half, layer, row, column, laser) over the `done` passes of both halves."""
+
+    sums: F64
+    done: int = 0
+    seconds: float = 0.0  # of processor time
+
+    @property
+    def mean(self) -> F64:
+        """Radiance, with the axes of `sums`; halves take turns."""
+        each = [(self.done + 1 - half) // len(HALVES) for half in range(len(HALVES))]
+        return np.asarray(self.sums / np.array(each)[:, None, None, None, None])
+
+    def enough(self, job: Job) -> bool:
+        """Whether that is all."""
+        return self.done >= len(HALVES) * job.passes
+
+
 def jobs() -> Iterator[Job]:
     """Everything that is wanted."""
     for wanted in WANTED:
@@ -104,50 +128,59 @@ def jobs() -> Iterator[Job]:
         light = next(light for light in scene.relight.lights if light.name == wanted.light)
         assert isinstance(light, Uniform | Environment)  # others are met by no path that leaves
         folder = shipped_references(wanted.file, scene.name)
-        for view in scene.relight.views:
+        for view in (view for view in scene.relight.views if view.name in wanted.views):
             yield Job(scene, light, view, wanted.passes, folder)
 
 
-def render(job: Job, work: Path, until: float) -> bool:
-    """Render a job's passes, as long as the clock (`time.monotonic`) is before `until`; whether all are done."""
-    import mitsuba as mi
+def render(job: Job, work: Path, most: int) -> int:
+    """Render at most so many passes of a half, and the reference once there are enough; how many were rendered."""
+    from benchmarks.volpath import DEPTH, FINER
 
-    from benchmarks.volpath import DEPTH, FINER, volpath_scene
-
-    kept = work / f"{job.name}.npz".replace(" ", "-")
     camera = PinholeCamera.from_config(job.view)
-    left, top, width, height = window = object_window(job.obj, camera)
-    sums = np.zeros((len(HALVES), len(LAYERS), height, width, 3))
-    done, seconds, how = 0, 0.0, [job.key, PASS, DEPTH, FINER]
+    left, top, width, height = object_window(job.obj, camera)
+    kept, how = work / f"{job.name}.npz".replace(" ", "-"), [job.key, PASS, DEPTH, FINER]
+    passes = Passes(np.zeros((len(HALVES), len(LAYERS), height, width, 3)))
     if kept.is_file():
         head, arrays = load_arrays(kept, VERSION, "delete it")
         if head["how"] == how:
-            sums, done, seconds = arrays["sums"], head["done"], head["seconds"]
-    medium = job.obj.medium
+            passes = Passes(arrays["sums"], head["done"], head["seconds"])
+    before = passes.done
+    if most and not passes.enough(job):
+        for _ in itertools.islice(rendered(job, camera, passes), most):
+            work.mkdir(parents=True, exist_ok=True)
+            save_arrays(kept, VERSION, {"sums": passes.sums}, how=how, done=passes.done, seconds=passes.seconds)
+    print(f"{job.name}: {passes.done} of {2 * job.passes} passes, {passes.seconds:.0f} s of processor time", flush=True)
+    if passes.enough(job):
+        halves = np.zeros((len(HALVES), len(LAYERS), 3, camera.height, camera.width), np.float32)
+        halves[..., top : top + height, left : left + width] = np.moveaxis(passes.mean, -1, 2)
+        save_reference(job.path, Reference(halves, noise_of(halves), job.key))
+    return passes.done - before
+
+
+def rendered(job: Job, camera: PinholeCamera, passes: Passes) -> Iterator[None]:
+    """Render on, half by half in turn, into `passes`."""
+    import mitsuba as mi
+
+    from benchmarks.volpath import volpath_scene
+
+    medium, window = job.obj.medium, object_window(job.obj, camera)
     black = replace(job.obj, medium=replace(medium, sigma_t=BLACK * medium.sigma_t, albedo=0 * medium.albedo))
     with tempfile.TemporaryDirectory() as folder:
         whole, shine = (
             volpath_scene(obj, camera, job.light, Path(folder), window, connect=False) for obj in (job.obj, black)
         )
-        while done < job.passes and time.monotonic() < until:
+        while not passes.enough(job):
             start = time.process_time()
-            for half in range(len(HALVES)):
-                image, surface = (
-                    np.array(mi.render(scene, spp=count * PASS, seed=seed(job, done, half, k)), np.float64)
-                    for k, (scene, count) in enumerate(((whole, 1), (shine, BLACK_PASSES)))
-                )
-                sums[half, LAYERS.index("subsurface")] += image - surface
-                sums[half, LAYERS.index("surface")] += surface
-            done, seconds = done + 1, seconds + time.process_time() - start
-            work.mkdir(parents=True, exist_ok=True)
-            save_arrays(kept, VERSION, {"sums": sums}, how=how, done=done, seconds=seconds)
-    print(f"{job.name}: {done} of {job.passes} passes, {seconds:.0f} s of processor time", flush=True)
-    if done < job.passes:
-        return False
-    halves = np.zeros((len(HALVES), len(LAYERS), 3, camera.height, camera.width), np.float32)
-    halves[..., top : top + height, left : left + width] = np.moveaxis(sums / done, -1, 2)
-    save_reference(job.path, Reference(halves, noise_of(halves), job.key))
-    return True
+            number, half = divmod(passes.done, len(HALVES))
+            image, surface = (
+                np.array(mi.render(scene, spp=count * PASS, seed=seed(job, number, half, k)), np.float64)
+                for k, (scene, count) in enumerate(((whole, 1), (shine, BLACK_PASSES)))
+            )
+            passes.sums[half, LAYERS.index("subsurface")] += image - surface
+            passes.sums[half, LAYERS.index("surface")] += surface
+            passes.done += 1
+            passes.seconds += time.process_time() - start
+            yield
 
 
 def seed(job: Job, number: int, half: int, layer: int) -> int:
@@ -186,13 +219,13 @@ def compare(job: Job) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Exit status 3 where the minutes were too few."""
+    """Exit status 3 where some are still missing."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.volpath_references", description=__doc__)
-    parser.add_argument("--minutes", type=float, default=np.inf, help="begin no pass after so long")
+    parser.add_argument("--most", type=int, default=sys.maxsize, help="passes of a half in this call")
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "volpath", help="where passes are kept")
     parser.add_argument("--compare", action="store_true", help="render nothing")
     options = parser.parse_args(arguments)
-    until, complete = time.monotonic() + 60 * options.minutes, True
+    most, complete = options.most, True
     if not options.compare:
         from disco_twin.light.backend import activate
 
@@ -202,9 +235,11 @@ def main(arguments: list[str] | None = None) -> int:
         mi.set_variant(VARIANT)
     for job in jobs():
         if not holds_outside_reference(job.folder, job.scene, job.light, job.view):
-            complete &= not options.compare and render(job, options.work, until)
+            most -= 0 if options.compare else render(job, options.work, most)
         if holds_outside_reference(job.folder, job.scene, job.light, job.view):
             compare(job)
+        else:
+            complete = False
     return 0 if complete else 3
 
 
