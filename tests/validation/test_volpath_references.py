@@ -55,7 +55,7 @@ def test_ours_agrees(job: Job) -> None:
     from below, what the surface reflects. And the noise is what it is taken for.
 
     Of an image with much noise what the surface reflects is left out: few samples have met the lobes there, and where
-    they did not the sum and its variance are low together (docs/decisions/0112).
+    they did not the sum and its variance are low together (docs/decisions/0113).
     """
     found = comparisons(job)
     if load_reference(job.path).noise > MUCH_NOISE:
