@@ -5,6 +5,7 @@ Rows that share their photons or their pipeline are made together, as a group; w
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -26,6 +27,8 @@ from pipeline.calibrate.calibration import Calibration
 from pipeline.capture.loop import Interrupted
 from pipeline.geometry.fresnel import Boundary
 from pipeline.relight.scores import Unscorable, score_halves
+
+log = logging.getLogger(__name__)
 
 FORMAT_VERSION = 3
 RECORD = "budget.json"
@@ -168,7 +171,7 @@ def _scored(run: Run, rows: Mapping[str, Images]) -> tuple[BudgetRow, ...]:
                 try:
                     score = score_halves(images[light.name, view.name], halves, masks[view.name])
                     figures = {"nrmse": score.nrmse, "nrmse_se": score.nrmse_se}
-                except Unscorable:
-                    pass
+                except Unscorable as why:
+                    log.warning("no score for %s of %s in %s: %s", row, light.name, view.name, why)
                 out.append(BudgetRow(row=row, light=light.name, view=view.name, **figures))
     return tuple(out)

@@ -134,7 +134,7 @@ def fit_profile(
     offset: F64 | float = 0.0,
     start: Profile | None = None,
 ) -> ProfileFit:
-    """Fit f and the tilt's slopes so that exp(offset) (1 + s tilt) (mean of f over the patches) meets the values.
+    """Fit f and the tilt's slopes so that exp(offset + s tilt) (mean of f over the patches) meets the values.
 
     tilt: (S, V) of the samples; offset: (S, V) or 0; start: a first guess. f is the mean over all directions.
     """

@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal, truncnorm
 
 from pipeline.geometry.mesh import RayMesh
 from pipeline.reconstruct.global_term.harmonics import harmonics
-from pipeline.reconstruct.global_term.totals import Kriging, at_most_zero, scaling, steady_totals
+from pipeline.reconstruct.global_term.totals import COMMON, Kriging, at_most_zero, scaling, steady_totals
 
 
 def test_kriging_agrees_with_the_dense_formulas() -> None:
@@ -62,7 +62,8 @@ def test_a_wild_column_takes_its_neighbours_total_and_a_known_one_keeps_its_own(
     assert after[wild] == pytest.approx(exact[wild], rel=0.12)
     assert after[known] == pytest.approx(before[known], rel=0.06)
     others = np.delete(np.arange(len(area)), [wild, known])
-    assert np.std((after / exact)[others]) < 0.05
+    stated = np.hypot(0.02, min(COMMON))  # of a total: what its column leaves open, and what a spot's samples share
+    assert np.std((after / exact)[others]) < 2 * stated
 
 
 def test_no_more_leaves_than_arrives(small: Synthetic) -> None:
