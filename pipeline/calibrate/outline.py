@@ -23,7 +23,8 @@ INSIDE, OUTSIDE, SPACING = 4.0, 3.0, 0.5  # pixels along the normal that an edge
 REACH, GRID = 2.0, 0.05  # an edge is looked for within this distance of the outline, in these steps
 CLEAR = 0.7  # pixels outside the outline where nothing of the object may be
 SHARP_RAD = 0.5  # between the triangles at an edge of the object's own; below, they stand for a smooth surface
-SUPERSAMPLE = 4  # rays per pixel and axis of a synthetic image
+SUPERSAMPLE = 4  # rays per pixel and axis of a synthetic image, this many pixels to either side of its rim:
+RIM_PX = 8  # as far as an edge is fitted, and where the spline through the pixels no longer tells
 NOISY = 0.25  # an edge whose model leaves more than this share of its height is not used
 
 
@@ -145,18 +146,22 @@ def synthetic(mesh: trimesh.Trimesh, camera: PinholeCamera, image: NDArray[np.fl
     The light is taken from the image's own inside: a matt surface shows second-order spherical harmonics of its normal
     under any distant light (Ramamoorthi and Hanrahan 2001, eq. 12), nine coefficients by least squares.
     """
-    s = SUPERSAMPLE
-    origins, directions = camera.rays(camera.pixel_centres(s))
-    surface = RayMesh.of(mesh)
-    found = surface.first_hit(origins, directions)
+    shape, surface, s = (camera.height, camera.width), RayMesh.of(mesh), SUPERSAMPLE
+    centres = camera.pixel_centres()
+    seen = surface.meets(*camera.rays(centres)).reshape(shape)
+    # Only near the rim is a pixel covered in part; the others are what their centres are.
+    rim = ndimage.binary_dilation(seen, iterations=RIM_PX) & ~ndimage.binary_erosion(seen, iterations=RIM_PX)
+    whole, partly = np.flatnonzero(seen & ~rim), np.flatnonzero(rim)
+    within = (np.stack(np.meshgrid(*[np.arange(s)] * 2), axis=-1).reshape(-1, 2) + 0.5) / s - 0.5
+    pixels = np.concatenate([centres[whole], (centres[partly, None] + within).reshape(-1, 2)])
+    owner = np.concatenate([whole, np.repeat(partly, s * s)])
+    found = surface.first_hit(*camera.rays(pixels))
     hit = np.flatnonzero(found.triangle >= 0)
     x, y, z = surface.smooth_normals(found.triangle[hit], found.barycentric[hit]).T
     basis = np.column_stack([np.ones_like(x), x, y, z, x * y, x * z, y * z, x * x - y * y, 3 * z * z - 1])
-    rows, columns = np.divmod(hit, camera.width * s)
-    pixel = rows // s * camera.width + columns // s
-    shape = (camera.height, camera.width)
-    count = np.bincount(pixel, minlength=shape[0] * shape[1])
-    mean = np.stack([np.bincount(pixel, b, minlength=len(count)) for b in basis.T], axis=1) / s**2
-    inside = ndimage.binary_erosion((count == s * s).reshape(shape)).ravel()
+    size, rays = shape[0] * shape[1], np.maximum(np.bincount(owner, minlength=len(centres)), 1)
+    mean = np.stack([np.bincount(owner[hit], b, minlength=size) for b in basis.T], axis=1) / rays[:, None]
+    full = np.bincount(owner[hit], minlength=size) == rays
+    inside = ndimage.binary_erosion(full.reshape(shape)).ravel()
     light = np.linalg.lstsq(mean[inside], np.asarray(image, np.float64).ravel()[inside], rcond=None)[0]
     return np.asarray(np.maximum(mean @ light, 0.0).reshape(shape))

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from hw.base.arrays import F64
 from hw.base.errors import InputError
-from pipeline.geometry.distortion import distort
+from pipeline.geometry.distortion import derivatives, distort
 from pipeline.geometry.nominal_rig import CameraConfig
 
 Row = tuple[float, float, float, float]
@@ -95,7 +95,7 @@ class PinholeCamera:
         return distort(xy, self.distortion)
 
     def undistort(self, xy: F64) -> F64:
-        """Inverse of `distort` by Newton's method with a numerical Jacobian; exact to 1e-12 where it is invertible."""
+        """Inverse of `distort` by Newton's method; exact to 1e-12 where it is invertible."""
         if not self.distortion.any():
             return xy
         out = xy.copy()
@@ -103,12 +103,10 @@ class PinholeCamera:
             residual = self.distort(out) - xy
             if np.abs(residual).max(initial=0.0) < 1e-13:
                 break
-            right, down = np.array([1e-6, 0.0]), np.array([0.0, 1e-6])
-            dx = (self.distort(out + right) - self.distort(out - right)) / 2e-6
-            dy = (self.distort(out + down) - self.distort(out - down)) / 2e-6
-            det = dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]
-            out[:, 0] -= (dy[:, 1] * residual[:, 0] - dy[:, 0] * residual[:, 1]) / det
-            out[:, 1] -= (dx[:, 0] * residual[:, 1] - dx[:, 1] * residual[:, 0]) / det
+            along, across, down = derivatives(out[:, 0], out[:, 1], self.distortion)
+            determinant, (x, y) = along * down - across**2, residual.T
+            out[:, 0] -= (down * x - across * y) / determinant
+            out[:, 1] -= (along * y - across * x) / determinant
         return out
 
     def project(self, points: F64) -> tuple[F64, F64]:

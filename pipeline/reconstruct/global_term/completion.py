@@ -125,13 +125,13 @@ def fit_laser(samples: Samples, laser: int, field: SymmetricField, start: F32) -
     found: ProfileFit | None = None
     smooth = scale * field.at_spots(y)
     for _ in range(ROUNDS):
-        found = fit_profile(pairs, measured, edge, samples.tilt, smooth, None if found is None else found.profile)
+        found = fit_profile(pairs, measured, edge, samples.tilt, smooth, found)
         prior = pairs.mean(found.profile) * found.tilt.factor(pairs.distance, samples.tilt)
         for _ in range(ROUNDS):
             relative, weight = measured.residual(prior * np.exp(smooth))
             y = field.solve(relative + smooth, weight, scale, y)
             smooth = scale * field.at_spots(y)
-    found = fit_profile(pairs, measured, edge, samples.tilt, smooth, None if found is None else found.profile)
+    found = fit_profile(pairs, measured, edge, samples.tilt, smooth, found)
     kernel = vertex_pairs.mean(found.profile)
     exponent = deviation(vertex_pairs.distance / edge) * (field.vertices @ y @ field.vertices.T)
     entries = 0.5 * (kernel + kernel.T) * np.exp(0.5 * (exponent + exponent.T))

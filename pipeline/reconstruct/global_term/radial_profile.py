@@ -8,6 +8,7 @@ McCullagh & Nelder 1989, ch. 9), which averages noise linearly.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,13 +21,15 @@ from pipeline.model.tilt import TiltLaw
 from pipeline.reconstruct.samples.distances import Pairs
 from pipeline.reconstruct.samples.samples import ANGULAR, Samples
 
+log = logging.getLogger(__name__)
+
 FAR_SCATTER = 0.3  # how the relative scatter of R_d about a smooth model grows with log(1 + edges / SCATTER_EDGES)
 SCATTER_EDGES = 3.0
 OUTLIER = 3.0  # standard deviations from which on a value counts less (Huber)
 LARGEST_STEP = 2.0  # relative: what lies further from its expectation is taken to lie here
 ITERATIONS = 12
 TILT_EDGES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # where the tilt's slopes stand
-ENOUGH = 3e-3  # change of log f at which the fit ends
+ENOUGH = 0.1 * ANGULAR  # change of any sample's logarithm at which the fit ends
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,13 @@ class LaserSamples:
         )
         edges = samples.spot_pairs.distance / samples.edge
         return cls(value, observed, dark, noise, samples.oblique.astype(np.float64), edges)
+
+    def seen(self) -> LaserSamples:
+        """What was observed alone, as a list: fields of (K,)."""
+        value, dark, noise, oblique, edges = (
+            a[self.observed] for a in (self.value, self.dark, self.noise, self.oblique, self.edges)
+        )
+        return LaserSamples(value, np.ones(len(value), bool), dark, noise, oblique, edges)
 
     def variance(self, expected: F64) -> F64:
         """Relative variance of a sample of this expectation by noise and obliqueness."""
@@ -132,37 +142,44 @@ def fit_profile(
     edge: float,
     tilt: F64,
     offset: F64 | float = 0.0,
-    start: Profile | None = None,
+    start: ProfileFit | None = None,
 ) -> ProfileFit:
     """Fit f and the tilt's slopes so that exp(offset + s tilt) (mean of f over the patches) meets the values.
 
     tilt: (S, V) of the samples; offset: (S, V) or 0; start: a first guess. f is the mean over all directions.
     """
     knots = _knots(edge, float(pairs.distance.max()) * 1.01)
-    profile = start or Profile(knots, _start(Profile(knots, np.zeros(len(knots) - 4)), measured, pairs.distance))
-    near_basis, basis = profile.basis(pairs.centres), profile.basis(pairs.distance)
-    n = basis.shape[2]
-    law = TiltLaw(edge * np.array(TILT_EDGES), np.zeros(len(TILT_EDGES)))
-    leaning = law.basis(pairs.distance, law.distance) * tilt[:, :, None]
+    if start is None:
+        first = Profile(knots, _start(Profile(knots, np.zeros(len(knots) - 4)), measured, pairs.distance))
+        profile, law = first, TiltLaw(edge * np.array(TILT_EDGES), np.zeros(len(TILT_EDGES)))
+    else:
+        profile, law = start.profile, start.tilt
+    observed, seen = measured.observed, measured.seen()
+    row = np.cumsum(observed).reshape(observed.shape) - 1  # of each observed pair among those that were
+    near = observed[pairs.first, pairs.second]
+    near_row, histogram = row[pairs.first[near], pairs.second[near]], pairs.histogram[near]
+    near_basis, n = profile.basis(pairs.centres), len(profile.coefficients)
+    leaning = law.basis(pairs.distance[observed], law.distance) * tilt[observed][:, None]
+    jacobian = np.concatenate([profile.basis(pairs.distance[observed]), leaning], axis=1)
+    given = np.broadcast_to(offset, observed.shape)[observed]
     slopes = _bend(len(law.slope)) + np.eye(len(law.slope))  # where nothing leans, they are 0
     prior = Prior(np.zeros(n + len(law.slope)), block_diag(_bend(n), slopes))
     for _ in range(ITERATIONS):
-        expected, factor = pairs.mean(profile), law.factor(pairs.distance, tilt)
-        jacobian = basis.copy()
-        slope = pairs.histogram @ (profile(pairs.centres)[:, None] * near_basis)
-        jacobian[pairs.first, pairs.second] = slope / expected[pairs.first, pairs.second][:, None]
-        relative, weight = measured.residual(expected * np.exp(offset) * factor)
-        flat = np.concatenate([jacobian, leaning], axis=2).reshape(-1, n + len(law.slope))
+        mean = pairs.mean(profile)[observed]
+        change = histogram @ (profile(pairs.centres)[:, None] * near_basis)
+        jacobian[near_row, :n] = change / mean[near_row, None]
+        relative, weight = seen.residual(mean * np.exp(given + leaning @ law.slope))
         now = np.concatenate([profile.coefficients, law.slope])
-        linear = Linearised(now, -relative.ravel(), flat, weight.ravel(), prior)
+        linear = Linearised(now, -relative, jacobian, weight, prior)
         step = linear.step()
         step *= min(1.0, 2.0 / np.abs(step).max())
         profile, law = Profile(knots, now[:n] + step[:n]), replace(law, slope=now[n:] + step[n:])
-        if np.abs(step).max() < ENOUGH:
+        if np.abs(jacobian @ step).max() < ENOUGH:
             break
+    else:
+        log.warning("the profile's fit was stopped after %d steps, before it converged", ITERATIONS)
     # A spot's samples err together: where it lies, the object around it.
-    spot = np.repeat(np.arange(len(pairs.distance)), pairs.distance.shape[1])
-    covariance = linear.covariance @ (linear.scatter(spot) + prior.precision) @ linear.covariance
+    covariance = linear.covariance @ (linear.scatter(np.nonzero(observed)[0]) + prior.precision) @ linear.covariance
     return ProfileFit(profile, law, covariance[n:, n:])
 
 

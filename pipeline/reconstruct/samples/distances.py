@@ -51,7 +51,10 @@ class Pairs:
         step = 0.04 * self.centres[-1]
         slope = np.log(kernel(table + step) / kernel(np.maximum(table - step, 0.0))) / (2 * step)
         laplacian = np.minimum(slope**2 + slope / np.maximum(table, step), 1 / self.spread)
-        out = np.exp(np.interp(self.distance, table, np.log(kernel(table)) + 0.5 * self.spread * laplacian))
+        logarithm = np.log(kernel(table)) + 0.5 * self.spread * laplacian
+        at = self.distance * ((TABLE - 1) / table[-1])
+        low = np.minimum(at.astype(np.int32), TABLE - 2)
+        out = np.exp(logarithm[low] + (at - low) * np.diff(logarithm)[low])
         out[self.first, self.second] = self.histogram @ kernel(self.centres)
         return np.asarray(out)
 

@@ -303,11 +303,14 @@ def highlights(
 
 
 def select_lasers(samples: Samples, lasers: I64) -> Samples:
-    """The samples of some of the lasers."""
-    return replace(
+    """The samples of some of the lasers. What was prepared from where spots and vertices lie stays."""
+    selected = replace(
         samples,
         values=samples.values[lasers],
         dark_variance=samples.dark_variance[lasers],
         noise_per_signal=samples.noise_per_signal[lasers],
         glow=tuple(replace(g, image=g.image[lasers], included=g.included[lasers]) for g in samples.glow),
     )
+    of_places = ("edge", "spot_pairs", "lit", "vertex_pairs")
+    vars(selected).update({name: made for name, made in vars(samples).items() if name in of_places})
+    return selected
