@@ -24,7 +24,7 @@ REACH, GRID = 2.0, 0.05  # an edge is looked for within this distance of the out
 CLEAR = 0.7  # pixels outside the outline where nothing of the object may be
 SHARP_RAD = 0.5  # between the triangles at an edge of the object's own; below, they stand for a smooth surface
 SUPERSAMPLE = 4  # rays per pixel and axis of a synthetic image, this many pixels to either side of its rim:
-RIM_PX = 8  # as far as an edge is fitted, and where the spline through the pixels no longer tells
+RIM_PX = 12  # as far as an edge is fitted, and where the spline through the pixels no longer tells
 NOISY = 0.25  # an edge whose model leaves more than this share of its height is not used
 
 
