@@ -25,6 +25,7 @@ FULL = 0.95  # of the full well: brighter ones may be clipped
 LEAST = 20  # observations between any two knots
 POWERS = np.linspace(1.0, 3.0, 9)  # of the gamma curve that the fit starts from
 STEPS = 30
+REWEIGHTED = 8  # of them that weigh anew; later a pixel or two would pass FULL to and fro for ever
 MODEL_CHI2, SIGMAS = 1.2, 5.0  # what a spline and a noise model may leave per degree of freedom; and chance beyond it
 
 
@@ -65,17 +66,19 @@ def fit_response(images: Sequence[U16], seconds: Sequence[float], sensor: Sensor
     values, light = _start(seen, time)
     free = slice(1, len(KNOTS) - 1)  # none is nothing, and full is full: the scale is the white balance's
     damping, best = 1e-3, np.inf
-    for _ in range(STEPS):
-        fit = _Equations.of(seen, time, values, light, sensor)
+    fit = _Equations.of(seen, time, values, light, sensor)
+    for taken in range(STEPS):
         step, pull = fit.solve(damping)
         ahead, lit = values.copy(), np.maximum(light + pull, 1e-6)
         ahead[free] += step
-        cost = _Equations.of(seen, time, ahead, lit, sensor, fit.weight).cost
+        rest = seen - _curve(ahead)(_exposure(time, lit))
+        cost = float((fit.weight * rest**2).sum())
         if cost < fit.cost:
             values, light, damping = ahead, lit, damping / 5
             if fit.cost - cost < 1e-7 * cost and abs(best - cost) < 1e-6 * cost:
                 break
             best = cost
+            fit = _Equations.of(seen, time, values, light, sensor, fit.weight if taken >= REWEIGHTED else None)
         else:
             damping *= 10
     fit = _Equations.of(seen, time, values, light, sensor)
@@ -85,13 +88,23 @@ def fit_response(images: Sequence[U16], seconds: Sequence[float], sensor: Sensor
     _require_steady(chi2, freedom)
     covariance = np.linalg.inv(fit.reduced())
     dense = np.linspace(0, 1, 8 * TABLE) ** 2
-    curve = CubicSpline(KNOTS, values, bc_type="natural")
+    curve = _curve(values)
     rising = np.maximum.accumulate(curve(dense))
     exposure = np.interp(np.linspace(0, 1, TABLE), rising, dense)
-    basis = CubicSpline(KNOTS, np.eye(len(KNOTS)), bc_type="natural")(exposure)[:, free]
+    basis = _curve(np.eye(len(KNOTS)))(exposure)[:, free]
     spread = np.sqrt(np.einsum("ni,ij,nj->n", basis, covariance, basis))
     slope = np.maximum(curve(exposure, 1), 1e-6)
     return Response(exposure, np.sqrt(max(chi2, 1.0)) * spread / slope, chi2)
+
+
+def _curve(values: F64) -> CubicSpline:
+    """Digital number by exposure, both as shares; (M,) values at the knots, or (M, N) of N curves."""
+    return CubicSpline(KNOTS, values, bc_type="natural")
+
+
+def _exposure(time: F64, light: F64) -> F64:
+    """(P, K) shares of the full well."""
+    return np.minimum(light[:, None] * time, 1.0)
 
 
 @dataclass(frozen=True)
@@ -112,8 +125,7 @@ class _Equations:
     @classmethod
     def of(cls, seen: F64, time: F64, values: F64, light: F64, sensor: Sensor, weight: F64 | None = None) -> _Equations:
         """seen: (P, K) shares of the digital range; light: (P,) share of the full well at the longest exposure."""
-        exposure = np.minimum(light[:, None] * time, 1.0)
-        curve = CubicSpline(KNOTS, values, bc_type="natural")
+        exposure, curve = _exposure(time, light), _curve(values)
         predicted, slope = curve(exposure), curve(exposure, 1)
         if weight is None:
             well = (sensor.saturation_dn - sensor.offset_dn) * sensor.gain_e_per_dn
@@ -122,12 +134,13 @@ class _Equations:
             variance = np.maximum(slope, 1e-3) ** 2 * electrons / well**2 + count**2 / 12
             weight = np.where(light[:, None] * time < FULL, 1.0 / variance, 0.0)
         rest = seen - predicted
-        basis = CubicSpline(KNOTS, np.eye(len(KNOTS)), bc_type="natural")(exposure)[:, :, 1:-1]
+        basis = _curve(np.eye(len(KNOTS)))(exposure)[:, :, 1:-1]
+        heavy = (basis * np.sqrt(weight)[:, :, None]).reshape(-1, basis.shape[2])
         by_light = slope * time
         return cls(
             (weight * by_light**2).sum(axis=1),
             np.einsum("pk,pkm->pm", weight * by_light, basis),
-            np.einsum("pk,pkm,pkn->mn", weight, basis, basis, optimize=True),
+            heavy.T @ heavy,
             (weight * by_light * rest).sum(axis=1),
             np.einsum("pk,pkm->m", weight * rest, basis),
             weight,
