@@ -73,7 +73,7 @@ def test_roulette_creates_nothing_in_the_mean() -> None:
     Expected behaviour: the balance's roulette term has the mean zero, for the wavelength that decides and for the
     weaker one that comes along, z-scores from 32 replicates.
     """
-    transport = Transport(twin(block(40.0, 10.0), "matched", 1.0, 10.0, [0.9, 0.8]))
+    transport = Transport(twin(block(40.0, 10.0), "matched", 1.0, 10.0, [0.9, 0.8]), cells=64)
     terms = []
     for seed in range(REPLICATES):
         balance = transport.trace(beam(), 1, 10_000, seed=seed).balance
@@ -219,7 +219,7 @@ def test_equilibrium_in_even_light(shape: str, kind: str) -> None:
     low, high = np.asarray(mesh.bounds, float)
     sigma_t = np.random.default_rng(3).uniform(0.2, 2.0, (1, 4, 4, 4)).astype(np.float32)
     medium = Medium(sigma_t, np.ones_like(sigma_t), low - 0.1, high + 0.1, (0.5,))
-    transport = Transport(TwinObject(mesh, TwinBoundary(kind, eta, 0.0), medium))  # type: ignore[arg-type]
+    transport = Transport(TwinObject(mesh, TwinBoundary(kind, eta, 0.0), medium), cells=64)  # type: ignore[arg-type]
     light = Uniform(radiance=1.0)
     traced = transport.trace(
         lambda group: light_source(light, transport.radius, group), REPLICATES, 20_000, seed=41, deposit=True
@@ -239,12 +239,14 @@ def test_equilibrium_in_even_light(shape: str, kind: str) -> None:
 def test_albedo_zero() -> None:
     """Black inside: nothing that entered comes back from a thick block; e^-tau passes straight through a thin one."""
     for kind in ("matched", "rough"):
-        balance = Transport(twin(block(40.0, 10.0), kind, 1.3, 10.0, [0.0])).trace(beam(), 1, 50_000, seed=51).balance
+        transport = Transport(twin(block(40.0, 10.0), kind, 1.3, 10.0, [0.0]), cells=64)
+        balance = transport.trace(beam(), 1, 50_000, seed=51).balance
         assert_balanced(balance)
         assert balance.escaped[0] == 0
         if kind == "matched":
             assert balance.absorbed[0] == 1
-    power, _ = escaped(Transport(twin(block(40.0, 0.7), "matched", 1.0, 1.0, [0.0])), beam(), 1, 200_000, seed=52)
+    transport = Transport(twin(block(40.0, 0.7), "matched", 1.0, 1.0, [0.0]), cells=64)
+    power, _ = escaped(transport, beam(), 1, 200_000, seed=52)
     share = math.exp(-np.float32(0.7))
     assert_z((power[0, 0] - share) / math.sqrt(share * (1 - share) / 200_000), "e^-tau")
 
@@ -257,7 +259,7 @@ def test_photons_that_are_cut_off_are_counted_and_told(
     Expected behaviour: what left, plus what is counted as inside, is what was launched, and one line says how much is
     lost; with the shipped limit nothing is, and nothing is said.
     """
-    transport = Transport(twin(block(20.0, 5.0), "smooth", 1.5, 2.0, [1.0]))
+    transport = Transport(twin(block(20.0, 5.0), "smooth", 1.5, 2.0, [1.0]), cells=64)
     whole = transport.trace(beam(), 1, 20_000, seed=59, deposit=True)
     assert whole.balance.inside[0] == 0
     assert not caplog.records
@@ -274,7 +276,8 @@ def test_photons_that_are_cut_off_are_counted_and_told(
 def test_albedo_one() -> None:
     """Nothing is absorbed: all that enters comes out again, however often it scatters."""
     for kind in ("matched", "smooth", "rough"):
-        balance = Transport(twin(block(20.0, 5.0), kind, 1.3, 10.0, [1.0])).trace(beam(), 1, 20_000, seed=53).balance
+        transport = Transport(twin(block(20.0, 5.0), kind, 1.3, 10.0, [1.0]), cells=64)
+        balance = transport.trace(beam(), 1, 20_000, seed=53).balance
         assert_balanced(balance)
         assert balance.absorbed[0] == 0
         if kind == "matched":
@@ -288,12 +291,12 @@ def test_clear_inside(sigma_t: float) -> None:
     """Hardly any medium. Matched: all light passes straight on. Smooth: a plate of glass, whose far face passes
     (1 - r) / (1 + r) of a normal beam and whose near face returns 2 r / (1 + r), r at its first surface.
     """
-    transport = Transport(twin(block(20.0, 5.0), "matched", 1.0, sigma_t, [0.9]))
+    transport = Transport(twin(block(20.0, 5.0), "matched", 1.0, sigma_t, [0.9]), cells=64)
     power, traced = escaped(transport, beam(), 1, 20_000, seed=54)
     assert_balanced(traced.balance)
     assert power[0, 0] == pytest.approx(1.0, abs=2e-5)
     r, walks = (0.5 / 2.5) ** 2, 200_000
-    transport = Transport(twin(block(20.0, 5.0), "smooth", 1.5, sigma_t, [0.9]))
+    transport = Transport(twin(block(20.0, 5.0), "smooth", 1.5, sigma_t, [0.9]), cells=64)
     traced = transport.trace(beam(), 1, walks, seed=55, deposit=True)
     assert_balanced(traced.balance)
     assert traced.deposits is not None
@@ -307,7 +310,7 @@ def test_clear_inside(sigma_t: float) -> None:
 def test_optical_thickness_of_ten_thousand() -> None:
     """A half-space again: 1000 mean free paths a millimetre must reflect like 10 (exact values, `half_spaces`)."""
     for kind, n, exact in (("matched", 1.0, (0.414947, 0.752721)), ("smooth", 1.5, (0.219919, 0.561981))):
-        transport = Transport(twin(block(20.0, 10.0), kind, n, 1000.0, [0.9, 0.99]))  # type: ignore[arg-type]
+        transport = Transport(twin(block(20.0, 10.0), kind, n, 1000.0, [0.9, 0.99]), cells=64)  # type: ignore[arg-type]
         power, traced = escaped(transport, beam(REPLICATES), REPLICATES, 10_000, seed=56)
         assert_balanced(traced.balance)
         assert_z(z_of_replicates(power, exact), f"n = {n}")
@@ -334,12 +337,12 @@ def layer(albedo: float, tau: float, cells: int = 400) -> tuple[float, float]:
 
 @pytest.mark.parametrize("depth", [0.004, 0.1, 1.0])
 def test_plate_thinner_than_a_cell(depth: float) -> None:
-    """A wide plate of 10 mean free paths a millimetre; a cell of the distance field measures a third of a millimetre.
+    """A wide plate of 10 mean free paths a millimetre; a cell of the distance field measures .7 mm.
 
     Expected behaviour: reflection and transmission of the integral equation of radiative transfer. The thinnest plate
     is but fifty times as deep as the offset that keeps rays off the surface they left.
     """
-    transport = Transport(twin(block(40.0, depth), "matched", 1.0, 10.0, [0.9]))
+    transport = Transport(twin(block(40.0, depth), "matched", 1.0, 10.0, [0.9]), cells=64)
     traced = transport.trace(beam(REPLICATES), REPLICATES, 60_000 if depth < 0.1 else 20_000, seed=57, deposit=True)
     assert_balanced(traced.balance)
     assert traced.deposits is not None
@@ -350,7 +353,7 @@ def test_plate_thinner_than_a_cell(depth: float) -> None:
 
 def test_light_that_misses() -> None:
     """A beam beside the object is all reflected, in the balance's sense that it never entered; images stay dark."""
-    transport = Transport(twin(block(10.0, 5.0), "rough", 1.3, 2.0, [0.9]))
+    transport = Transport(twin(block(10.0, 5.0), "rough", 1.3, 2.0, [0.9]), cells=64)
     view = camera((0.0, 10.0, 400.0), 20.0, 8)
     traced = transport.trace(beam(origin=(30.0, 0.0, 50.0)), 1, 1000, seed=58, cameras=[view], deposit=True)
     assert traced.balance.reflected[0] == 1

@@ -86,7 +86,7 @@ def test_cameras_see_what_leaves() -> None:
     """
     x, w = np.polynomial.legendre.leggauss(8)
     mu, w = np.sqrt((x + 1) / 2), w / 2
-    transport = Transport(twin(block(80.0, 20.0), "rough", 1.3, 10.0, [0.9, 0.99]))
+    transport = Transport(twin(block(80.0, 20.0), "rough", 1.3, 10.0, [0.9, 0.99]), cells=64)
     turns = 2.4 * np.arange(len(mu))
     places = 3000 * np.stack([np.sqrt(1 - mu**2) * np.cos(turns), np.sqrt(1 - mu**2) * np.sin(turns), mu], axis=1)
     views = [camera(place, 40.0, 15) for place in places]
@@ -107,7 +107,8 @@ def test_variance_images_are_calibrated(kind: str, worst: float) -> None:
     Expected behaviour: over 64 replicates the empirical variance is the estimated one in every decade of brightness,
     or above it by what the estimate leaves out: splats of one photon into one pixel are correlated (stated bound).
     """
-    transport = Transport(twin(trimesh.creation.icosphere(subdivisions=4, radius=5.0), kind, 1.3, 1.6, [0.99]))  # type: ignore[arg-type]
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=5.0)
+    transport = Transport(twin(ball, kind, 1.3, 1.6, [0.99]), cells=64)  # type: ignore[arg-type]
     view = camera(VIEWS[0], 12.0, 48)
     traced = transport.trace(beam(64, **SPOT), 64, 5_000, seed=73, cameras=[view])
     assert traced.images is not None
