@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 OUT ?= out/quick
+unexport PYTHONDONTWRITEBYTECODE  # containers set it; each of the many processes would compile all that it imports
 
 .PHONY: demo test lint validate install references outside accuracy picture curves clean
 .DEFAULT_GOAL := help
