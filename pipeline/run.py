@@ -48,6 +48,7 @@ from pipeline.reconstruct.samples.image_operators import IMAGE_OPERATORS
 from pipeline.reconstruct.samples.samples import Samples, SampleStatistics, take_samples
 from pipeline.reconstruct.samples.samples_file import save_samples
 from pipeline.reconstruct.settings import ReconstructConfig
+from pipeline.reconstruct.surface_term.lobe_fit import subtract_reflection
 from pipeline.records import NominalRigFile, SensorFile
 from pipeline.relight.lights import Light
 from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
@@ -151,6 +152,8 @@ def run(capture: Path, work: Path, request: Request, given: Path | None = None) 
     samples, statistics = gather(capture, calibration, mesh, settings, stages)
     if statistics.coverage == 0:
         raise InputError("no camera sees any spot's surroundings", file=capture, remedy="check the cameras' poses")
+    with stages.stage("surface"):
+        samples["footprint"] = subtract_reflection(samples["footprint"])
     save_samples(work / "samples.npz", samples["footprint"])
     with stages.stage("distances"):
         shared = samples["footprint"]  # the methods share its distances

@@ -66,6 +66,8 @@ def omissions(samples: Samples, calibration: Calibration, scan: str | None = Non
     if is_opaque(samples):
         share = share_within_an_edge(samples)
         out.append(("global term", f"{share:.1%} of the light leaves within one edge of its spot: opaque"))
+    if samples.lobe is not None and samples.lobe.because:
+        out.append(("the surface's reflection", samples.lobe.because))
     groups = colour_groups(samples)
     if len(groups) > 1 and len(set(groups)) < len(groups):
         kept = ", ".join(f"{calibration.lasers[k].wavelength_nm:g} nm" for k in sorted(set(groups)))

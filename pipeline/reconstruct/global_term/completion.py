@@ -221,7 +221,10 @@ def complete(samples: Samples) -> RelightableModel:
         leaving, entering = tilts(samples.mesh, samples.spots, view.camera.position, samples.eta)
         tilt = leaving + entering
         distance = samples.spot_pairs.distance
-        return np.stack([fit.at_spots * fit.tilt.factor(distance, tilt) for fit in fits])
+        reflected = np.zeros_like(distance)  # the images still hold it
+        if samples.lobe is not None and not samples.lobe.because:
+            reflected = samples.lobe.strength * samples.beams.in_view(view.camera, samples.lobe.alpha).toarray()
+        return np.stack([fit.at_spots * fit.tilt.factor(distance, tilt) + reflected for fit in fits])
 
     measured_ratio = measure_boundary(samples.mesh, samples.eta, samples.glow, expected)
     boundary = of_mean_one(measured_ratio, samples, np.stack([fit.at_spots for fit in fits]))
@@ -237,5 +240,10 @@ def complete(samples: Samples) -> RelightableModel:
         np.stack([fit.tilt.slope for fit in fits]) if tilted else None,
         fits[0].tilt.distance if tilted else None,
     )
-    why = f"samples show no change with direction beyond their noise (chi^2 at most {limit:.0f})"
-    return RelightableModel(samples.mesh, boundary, (term,), {} if tilted else {f"{WITHOUT}angular moments": why})
+    provenance = {}
+    if samples.lobe is not None and not samples.lobe.because:
+        provenance["taken off"] = f"the surface's reflection, {samples.lobe.described(samples.eta)}"
+    if not tilted:
+        why = f"samples show no change with direction beyond their noise (chi^2 at most {limit:.0f})"
+        provenance[f"{WITHOUT}angular moments"] = why
+    return RelightableModel(samples.mesh, boundary, (term,), provenance)

@@ -7,8 +7,9 @@ beam of power Phi; no foreshortening cosine, since the whole beam enters). So R_
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -18,11 +19,13 @@ from scipy import sparse
 from hw.base.arrays import F32, F64, I64, Bool
 from pipeline.calibrate.calibration import Calibration
 from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.mesh import RayMesh
 from pipeline.plan.plan import Plan
 from pipeline.reconstruct.samples.distances import Pairs, beam_footprints, spot_pairs, vertex_pairs
 from pipeline.reconstruct.samples.image_operators import ImageOperator
 from pipeline.reconstruct.samples.resample import BatchResult, Sums, ViewReader, look_up, resample
 from pipeline.reconstruct.samples.spots import Spots, locate_spots, tilts
+from pipeline.reconstruct.samples.surface_lobe import BeamOnHats, BeamReadings, SurfaceLobe
 from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.stream.stream import StreamReader
 
@@ -53,6 +56,8 @@ class Samples:
     tilt: (S, V) sum of `tilts` at both ends, mean over the cameras
     cosine: (S, V) between normal and direction to the camera, mean over the cameras; 0 where not observed
     glow: per view, images summed over its spots
+    read_in_beams: which cameras read the vertices that the beams meet
+    lobe: what of the surface's reflection was taken off the values; None where nobody has looked for it
     """
 
     mesh: trimesh.Trimesh
@@ -65,11 +70,20 @@ class Samples:
     tilt: F64
     cosine: F32
     glow: tuple[SpotSumImage, ...] = ()
+    read_in_beams: BeamReadings = field(default_factory=BeamReadings.none)
+    lobe: SurfaceLobe | None = None
 
     @cached_property
     def edge(self) -> float:
         """Mean length of the scan's edges, mm."""
         return float(self.mesh.edges_unique_length.mean())
+
+    def with_readings(self, **fields: Any) -> Samples:
+        """Other readings of the same spots and vertices: what was prepared from where those lie stays."""
+        of_places = ("edge", "spot_pairs", "lit", "vertex_pairs")
+        other = replace(self, **fields)
+        vars(other).update({name: made for name, made in vars(self).items() if name in of_places})
+        return other
 
     @property
     def variance(self) -> F32:
@@ -85,6 +99,12 @@ class Samples:
     def lit(self) -> sparse.csr_array:
         """(S, V) mean of each vertex's hat function over a beam's footprint; rows add up to 1."""
         return beam_footprints(self.mesh, self.spots)
+
+    @property
+    def beams(self) -> BeamOnHats:
+        """The beams where they meet the scan, and the cameras that read it there."""
+        density = sparse.csr_array(self.lit / RayMesh.of(self.mesh).vertex_areas)
+        return BeamOnHats(self.spots, self.eta, density, tuple(g.camera for g in self.glow), self.read_in_beams)
 
     @cached_property
     def vertex_pairs(self) -> Pairs:
@@ -227,7 +247,20 @@ class _Gathered:
             (common * tilt).sum(axis=1).astype(np.float64),
             (common * cosine).sum(axis=1).astype(np.float32),
             glow,
+            self.in_beams(beam_footprints(mesh, spots), common),
         )
+
+    def in_beams(self, lit: sparse.csr_array, weight: F32) -> BeamReadings:
+        """The readings of vertices that beams meet. lit: (S, V) nonzero there; weight: (S, C, V) of the cameras."""
+        found = []
+        for view in range(self.plan.views):
+            spots, camera = self.block(view)
+            at = sparse.coo_array(lit[spots])
+            share = weight[spots, camera][at.row, at.col]
+            kept = share > 0
+            found.append((at.row[kept] + spots.start, at.col[kept], np.full(kept.sum(), view), share[kept]))
+        spot, vertex, of_view = (np.concatenate([f[k] for f in found]).astype(np.int64) for k in range(3))
+        return BeamReadings(spot, vertex, of_view, np.concatenate([f[3] for f in found]).astype(np.float64))
 
 
 def take_samples(
@@ -303,14 +336,10 @@ def highlights(
 
 
 def select_lasers(samples: Samples, lasers: I64) -> Samples:
-    """The samples of some of the lasers. What was prepared from where spots and vertices lie stays."""
-    selected = replace(
-        samples,
+    """The samples of some of the lasers."""
+    return samples.with_readings(
         values=samples.values[lasers],
         dark_variance=samples.dark_variance[lasers],
         noise_per_signal=samples.noise_per_signal[lasers],
         glow=tuple(replace(g, image=g.image[lasers], included=g.included[lasers]) for g in samples.glow),
     )
-    of_places = ("edge", "spot_pairs", "lit", "vertex_pairs")
-    vars(selected).update({name: made for name, made in vars(samples).items() if name in of_places})
-    return selected

@@ -99,7 +99,8 @@ def test_a_perfect_scan_is_left_as_it_is() -> None:
 
 
 def test_a_bump_on_a_balls_scan_is_taken_off() -> None:
-    """A ball's scan has a bump of .25 mm on the outline of a view: two thirds and more of it go, little else moves."""
+    """A ball's scan has a bump of .25 mm on the outline of a view: two thirds and more of it go; elsewhere a tenth of
+    it is the most that comes."""
     ball = trimesh.creation.icosphere(4, 16.0)
     seen = silhouettes(4, ball)
     sight = seen.truth[0].pose[:3, :3]
@@ -108,7 +109,7 @@ def test_a_bump_on_a_balls_scan_is_taken_off() -> None:
     scan = fitted(seen, displaced(ball, bump)).scan
     left = bump + scan.displacement
     assert np.abs(left[bump > 0.2]).max() < 0.08
-    assert rms(left[bump < 0.01]) < 0.02
+    assert rms(left[bump < 0.01]) < 0.025
     assert rms(left / scan.error) < 1.5
 
 

@@ -1,0 +1,1 @@
+"""What the surface reflects, as far as the images of spots tell."""
