@@ -78,16 +78,18 @@ def build_distance_field(mesh: trimesh.Trimesh, cells: int = 128) -> DistanceFie
     flat = (index[:, 2] * cells + index[:, 1]) * cells + index[:, 0]
     touched = np.zeros(cells**3, bool)
     touched[flat] = True
-    summed = np.zeros((cells**3, 3))
-    for axis in range(3):
-        summed[:, axis] = np.bincount(flat, np.asarray(mesh.face_normals)[faces, axis], minlength=cells**3)
-    steps, nearest = ndimage.distance_transform_edt(~touched.reshape((cells,) * 3), return_indices=True)
+    place = np.cumsum(touched, dtype=np.int32) - 1  # of a touched cell among them
+    faced = np.asarray(mesh.face_normals)[faces]
+    summed = np.stack([np.bincount(place[flat], faced[:, axis]) for axis in range(3)], axis=1)
+    empty = ~touched.reshape((cells,) * 3)
+    nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
+    steps = np.sqrt(sum((n - k) ** 2 for n, k in zip(nearest, np.ogrid[:cells, :cells, :cells], strict=True)))
     distance = np.maximum(steps * cell - cell * math.sqrt(3.0) / 2 - spacing, 0.0)
-    normal = summed[(nearest[0] * cells + nearest[1]) * cells + nearest[2]]
+    surface = place[(nearest[0] * cells + nearest[1]) * cells + nearest[2]]
     near = np.argwhere(steps <= NEAR)
     # Light flies inside: cells that are surely outside keep their bound.
     away = (near - nearest[:, near[:, 0], near[:, 1], near[:, 2]].T)[:, ::-1]
-    facing = np.einsum("nk,nk->n", away, normal[tuple(near.T)])
+    facing = np.einsum("nk,nk->n", away, summed[surface[tuple(near.T)]])
     near = near[(facing <= 0) | (steps[tuple(near.T)] < 2)]
     exact = distance_to(mesh, corner + (near[:, ::-1] + 0.5) * cell)
     distance[tuple(near.T)] = exact
@@ -96,6 +98,7 @@ def build_distance_field(mesh: trimesh.Trimesh, cells: int = 128) -> DistanceFie
     for axis in range(3):
         for rim in (0, -1):
             np.moveaxis(distance, axis, 0)[rim] = 0.0  # a look-up outside the grid is clamped to its rim
-        normal[..., axis] = ndimage.gaussian_filter(normal[..., axis], 1.5, truncate=2.0)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    return DistanceField(distance.astype(np.float32), normal.astype(np.float32), corner, cell)
+    parts = [ndimage.gaussian_filter(summed[:, axis][surface], 1.5, truncate=2.0) for axis in range(3)]
+    length = np.maximum(np.sqrt(parts[0] ** 2 + parts[1] ** 2 + parts[2] ** 2), 1e-12)
+    normal = np.stack([(part / length).astype(np.float32) for part in parts], axis=-1)
+    return DistanceField(distance.astype(np.float32), normal, corner, cell)
