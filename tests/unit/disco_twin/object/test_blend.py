@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from disco_twin.object.blend import TRIANGLES, blend, blend_function
@@ -56,11 +58,16 @@ VOLUMES = {
 }
 
 
+@cache
+def blended(name: str) -> trimesh.Trimesh:
+    """One of those, made once."""
+    return blend(VOLUMES[name][0])
+
+
 @pytest.mark.parametrize("name", VOLUMES)
 def test_volume(name: str) -> None:
     """Vertices lie on the surface, so that chords miss a volume of the order of edge^2 / r^2."""
-    config, volume = VOLUMES[name]
-    mesh = blend(config)
+    mesh, volume = blended(name), VOLUMES[name][1]
     assert mesh.volume == pytest.approx(volume, rel=3e-3)
     assert mesh.is_watertight and mesh.is_winding_consistent
     assert mesh.euler_number == 2
@@ -69,9 +76,9 @@ def test_volume(name: str) -> None:
 
 
 def test_area_and_place() -> None:
-    mesh = blend(made(ROD))
+    mesh = blended("capsule")
     assert mesh.area == pytest.approx(2 * np.pi * 8 * 20 + 4 * np.pi * 64, rel=2e-3)
-    egg = blend(made(EGG))
+    egg = blended("ellipsoid")
     turn = Rotation.from_euler("xyz", EGG["turn_deg"], degrees=True)
     own = turn.inv().apply(egg.vertices - np.array(EGG["centre_mm"]))
     np.testing.assert_allclose((own**2 / np.array(EGG["radii_mm"]) ** 2).sum(axis=1), 1, atol=1e-6)
@@ -96,7 +103,7 @@ def test_rounding_fills_the_notch_and_reaches_no_farther() -> None:
 
 
 def test_the_same_blend_gives_the_same_mesh() -> None:
-    one, again = blend(made(ROD)), blend(made(ROD))
+    one, again = blended("capsule"), blend(made(ROD))
     assert np.array_equal(one.vertices, again.vertices)
     assert np.array_equal(one.faces, again.faces)
 
