@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -30,7 +31,7 @@ class Peak:
 
 def find_peak(image: NDArray[np.floating]) -> Peak:
     """The brightest spot of an (H, W) radiance image; single bright pixels (noise) are no spot."""
-    smooth = ndimage.median_filter(np.asarray(image, np.float64), 3, mode="nearest")
+    smooth = cv2.medianBlur(np.ascontiguousarray(image, np.float32), 3).astype(np.float64)
     top = np.unravel_index(int(smooth.argmax()), smooth.shape)
     value = float(smooth[top])
     labels, _ = ndimage.label(smooth > ABOVE * value)

@@ -145,7 +145,7 @@ def test_a_scan_becomes_a_mesh_of_nearly_equal_triangles() -> None:
 
 
 def test_the_scanner_errs_as_the_thesis_says() -> None:
-    points = np.asarray(experiment().object.mesh.vertices)
+    points = np.asarray(experiment().object.mesh.vertices)[::8]
     errors = np.array([geometry_error(points, np.random.default_rng(s)) for s in range(40)])
     assert np.sqrt((errors**2).mean()) == pytest.approx(0.1, rel=0.1)
     assert np.clip(errors, -LARGEST_MM, LARGEST_MM).max() <= LARGEST_MM
