@@ -155,6 +155,19 @@ def minimise(
     return Linearised(x, misses, derivative(x), loss.weight(misses), prior)
 
 
+def likeliest(x: F64, cost: F64) -> tuple[float, float]:
+    """Where a parabola through the lowest of (n,) chi^2 and its neighbours is lowest, and the standard error.
+
+    x: (n,) equally spaced values of an unknown that were all tried
+    """
+    k = int(np.clip(np.argmin(cost), 1, len(cost) - 2))
+    step, low, high = x[1] - x[0], cost[k - 1] - cost[k], cost[k + 1] - cost[k]
+    if low + high <= 0:
+        return float(x[np.argmin(cost)]), float(x[-1] - x[0])
+    shift = np.clip(0.5 * (low - high) / (low + high), -1.0, 1.0)
+    return float(x[k] + shift * step), float(min(step * np.sqrt(2.0 / (low + high)), x[-1] - x[0]))
+
+
 def _finite(values: F64) -> F64:
     """The same. Raises: DiscoError where one is not finite."""
     if not np.isfinite(values).all():

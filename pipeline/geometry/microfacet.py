@@ -1,4 +1,4 @@
-"""The reflection of a rough dielectric surface: microfacets of the GGX distribution (Walter et al. 2007)."""
+"""A rough dielectric surface: microfacets of the GGX distribution (Walter et al. 2007)."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from numpy.typing import ArrayLike
 
 from hw.base.arrays import F64
 from pipeline.geometry.fresnel import transmittance
+
+FACETS = 48  # per side of the square that the visible facets are drawn from
 
 
 def ggx(cosine: ArrayLike, alpha: float) -> F64:
@@ -28,3 +30,30 @@ def reflected(half: F64, difference: F64, entering: F64, leaving: F64, eta: floa
     fresnel = 1.0 - transmittance(difference, eta)
     shown = smith(entering, alpha) * smith(leaving, alpha)
     return np.asarray(fresnel * ggx(half, alpha) * shown / (4.0 * np.maximum(entering * leaving, 1e-6)))
+
+
+def rough_transmittance(cosine: ArrayLike, eta: float, alpha: float) -> F64:
+    """Share of light transmitted by the facets, for (K,) cosines between the mean normal and the direction outside.
+
+    By the midpoint rule over the facets that the direction sees (Heitz 2018), each weighted by what Fresnel lets through
+    and by the share of it that leaves unshadowed (eq. 21, 23); what facets pass to each other is lost.
+    """
+    c = np.maximum(np.asarray(cosine, np.float64), 1e-6)[:, None]
+    s = np.sqrt(1.0 - c**2)
+    side = (np.arange(FACETS) + 0.5) / FACETS
+    radius, turn = (a.reshape(1, -1) for a in np.meshgrid(np.sqrt(side), 2.0 * np.pi * side, indexing="ij"))
+    # The direction, stretched by alpha, sees a hemisphere of facets as a disc; its lower half is seen obliquely.
+    length = np.hypot(alpha * s, c)
+    x, z = alpha * s / length, c / length
+    across, up = radius * np.cos(turn), radius * np.sin(turn)
+    up = 0.5 * (1.0 - z) * np.sqrt(1.0 - across**2) + 0.5 * (1.0 + z) * up
+    towards = np.sqrt(np.maximum(1.0 - across**2 - up**2, 0.0))
+    facet = np.stack(
+        [alpha * (x * towards - z * up), alpha * across + 0.0 * up, np.maximum(x * up + z * towards, 1e-9)]
+    )
+    facet /= np.linalg.norm(facet, axis=0)
+    own = s * facet[0] + c * facet[2]
+    within = np.sqrt(1.0 - (1.0 - own**2) / eta**2)
+    down = c / eta - (own / eta - within) * facet[2]  # cosine of the refracted direction to the mean normal
+    passed = transmittance(own, eta) * np.where(down > 0, smith(down, alpha), 0.0)
+    return np.asarray(passed.mean(axis=1))

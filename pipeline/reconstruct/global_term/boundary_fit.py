@@ -1,10 +1,13 @@
-"""The boundary's transmittance at grazing angles, measured against that of the assumed index (F_t of thesis eq. 2.1).
+"""The boundary's transmittance at all angles, measured against that of the assumed index (F_t of thesis eq. 2.1).
 
 Samples come from views that are not too oblique. The same images show the surface at grazing angles too, where a rough
-one transmits up to twice what the smooth one of the assumed index does: most of a relit image's error near the outline.
-The images of all spots are summed and compared, by view cosine, with what the model expects. By reciprocity the ratio
-holds for light that enters, too. R_d and the transmittance share one level, which images do not part: R_d has it, and
-the ratio is 1 on average where samples were taken (docs/decisions/0093).
+one transmits up to five times what the smooth one of the assumed index does: most of a relit image's error near the
+outline. The images of all spots are summed and compared, by view cosine, with what the model expects. There normals
+that are off by a few degrees, and light that the model's hats smear around an edge, change the light as much as
+roughness does; so the curve is that of a GGX surface, whose roughness is fitted with a weight that knows the normals'
+errors, times a line in the cosine for the index and for light that is not equal in all directions inside
+(docs/decisions/0124). By reciprocity it holds for light that enters, too. R_d and the transmittance share one level,
+which images do not part: R_d has it, and the ratio is 1 on average where samples were taken (docs/decisions/0093).
 """
 
 from __future__ import annotations
@@ -16,15 +19,25 @@ import numpy as np
 import trimesh
 
 from hw.base.arrays import F64
+from pipeline.calibrate.least_squares import Huber, Prior, likeliest, minimise
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import Boundary, transmittance
 from pipeline.geometry.mesh import RayMesh
+from pipeline.geometry.microfacet import rough_transmittance
 from pipeline.geometry.pixel_footprints import trace_pixels
 from pipeline.reconstruct.samples.samples import Samples, SpotSumImage
 
 EDGES = np.array([0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0 + 1e-9])
-LEAST, MOST = 0.5, 2.0  # of the smooth transmittance; at the outline itself scan and object do not meet
 SUPERSAMPLE = 3
+ALPHAS = np.geomspace(0.04, 0.64, 13)
+USUAL, USUAL_SPREAD = np.log(0.25), 0.7  # of log alpha, before the images say anything
+LINE_SPREAD = (
+    0.1  # of the slope of the line: what an index of 1.3 to 1.7, and light inside that is not diffuse, make it
+)
+NORMAL_ERROR = 0.05  # rad, of the scan's normals
+BIN_ERROR = 0.02  # relative, of a bin: what the model leaves of the sums
+OUTLIER = Huber(2.0)
+CURVE = np.concatenate([[0.0, 0.01, 0.02, 0.035], np.linspace(0.05, 1.0, 20)])  # cosines of the curve's corners
 
 
 @dataclass(frozen=True)
@@ -80,9 +93,31 @@ def measure_boundary(
             for view in views
         ),
     )
-    if not len(middle):
+    return rough_boundary(eta, middle, ratio)
+
+
+def rough_boundary(eta: float, cosines: F64, ratio: F64) -> Boundary:
+    """The boundary whose transmittance over the smooth one is (K,) `ratio` at (K,) cosines, within their errors."""
+    known = (ratio > 0) & (cosines > 0)
+    if known.sum() < 3 or eta - 1 < 1e-3:  # a matched boundary transmits all light
         return Boundary(eta)
-    return Boundary(eta, tuple(map(float, middle)), tuple(map(float, np.clip(ratio, LEAST, MOST))))
+    c, measured = cosines[known], np.log(ratio[known])
+    slope = np.gradient(np.log(transmittance(np.stack([c - 0.01, c, c + 0.01]), eta)), 0.01, axis=0)[1]
+    sigma = np.hypot(BIN_ERROR, NORMAL_ERROR * np.sqrt(1.0 - c**2) * slope)
+    line = np.column_stack([np.ones(len(c)), 1.0 - c])
+    prior = Prior(np.zeros(2), np.diag([1e-6, LINE_SPREAD**-2]))
+
+    def fitted(log_alpha: float) -> tuple[F64, float]:
+        rough = np.log(rough_transmittance(c, eta, float(np.exp(log_alpha))) / transmittance(c, eta))
+        found = minimise(lambda x: (line @ x + rough - measured) / sigma, np.zeros(2), prior, loss=OUTLIER)
+        cost = OUTLIER.cost(found.residual).sum() + (found.value[1] / LINE_SPREAD) ** 2
+        return found.value, float(cost + ((log_alpha - USUAL) / USUAL_SPREAD) ** 2)
+
+    tried = np.array([fitted(log_alpha)[1] for log_alpha in np.log(ALPHAS)])
+    best, _ = likeliest(np.log(ALPHAS), tried)
+    at, (level, tilt) = np.maximum(CURVE, 1e-3), fitted(best)[0]
+    curve = rough_transmittance(at, eta, float(np.exp(best))) / transmittance(at, eta) * np.exp(level + tilt * (1 - at))
+    return Boundary(eta, tuple(map(float, CURVE)), tuple(map(float, curve)))
 
 
 def of_mean_one(boundary: Boundary, samples: Samples, expected: F64) -> Boundary:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from hw.base.arrays import F64, Bool
-from pipeline.calibrate.least_squares import Huber, Prior, minimise
+from pipeline.calibrate.least_squares import Huber, Prior, likeliest, minimise
 from pipeline.geometry.mesh import RayMesh
 from pipeline.reconstruct.global_term.radial_profile import LaserSamples, fit_profile
 from pipeline.reconstruct.samples.samples import Samples
@@ -110,7 +110,7 @@ def _beyond(samples: Samples, grey: LaserSamples, expected: F64) -> SurfaceLobe:
     for _ in range(2):  # the first time the reflection itself is part of the scatter
         scatter = max(1.4826 * float(np.median(np.abs(left))), 1e-3)
         tried = [with_alpha(alpha, scatter) for alpha in ALPHAS]
-        log_alpha, spread = _peak(np.log(ALPHAS), np.array([one.gain for one in tried]))
+        log_alpha, spread = likeliest(np.log(ALPHAS), -np.array([one.gain for one in tried]))
         best = with_alpha(float(np.exp(log_alpha)), scatter)
         left = best.left
     limit = float(chi2.ppf(1 - BY_CHANCE, 2))
@@ -137,16 +137,6 @@ def _grey(samples: Samples) -> LaserSamples:
         for name, power in (("value", 1), ("dark", 2), ("noise", 2))
     )
     return LaserSamples(value, observed, dark, noise, each[0].oblique, each[0].edges)
-
-
-def _peak(x: F64, y: F64) -> tuple[float, float]:
-    """Where a parabola through the highest of (n,) -chi^2 and its neighbours is highest, and the standard error."""
-    k = int(np.clip(np.argmax(y), 1, len(y) - 2))
-    step, low, high = x[1] - x[0], y[k] - y[k - 1], y[k] - y[k + 1]
-    if low + high <= 0:
-        return float(x[np.argmax(y)]), float(x[-1] - x[0])
-    shift = np.clip(0.5 * (low - high) / (low + high), -1.0, 1.0)
-    return float(x[k] + shift * step), float(min(step * np.sqrt(2.0 / (low + high)), x[-1] - x[0]))
 
 
 @dataclass(frozen=True)

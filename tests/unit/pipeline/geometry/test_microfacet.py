@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.geometry.fresnel import mean_transmittance
-from pipeline.geometry.microfacet import ggx, reflected, smith
+from pipeline.geometry import microfacet
+from pipeline.geometry.fresnel import mean_transmittance, transmittance
+from pipeline.geometry.microfacet import ggx, reflected, rough_transmittance, smith
 
 
 @pytest.mark.parametrize("alpha", [0.05, 0.2, 0.5, 1.0])
@@ -52,3 +53,19 @@ def test_a_nearly_smooth_surface_reflects_what_is_not_transmitted() -> None:
     share[ok] = brdf * out[ok, 2] / density
     expected = 1 - mean_transmittance(eta)
     assert share.mean() == pytest.approx(expected, abs=4 * share.std() / n**0.5 + 0.005 * expected)
+
+
+def test_hardly_rough_transmits_like_smooth() -> None:
+    c = np.array([0.1, 0.3, 0.6, 1.0])
+    np.testing.assert_allclose(rough_transmittance(c, 1.4, 0.003), transmittance(c, 1.4), rtol=2e-3)
+
+
+def test_the_quadrature_converges(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rationale: the midpoint rule in two dimensions; a quarter of the points a side is four times as far off or more."""
+    c, value = np.array([0.1, 0.3, 0.7]), {}
+    for n in (12, 48, 384):
+        monkeypatch.setattr(microfacet, "FACETS", n)
+        value[n] = rough_transmittance(c, 1.5, 0.3)
+    coarse, fine = (np.abs(value[n] - value[384]).max() for n in (12, 48))
+    assert fine < coarse / 3
+    assert fine < 2e-3  # a tenth of what the fit takes a bin to be off by

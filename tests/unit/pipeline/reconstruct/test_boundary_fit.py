@@ -1,0 +1,52 @@
+"""The boundary's curve from what views see of it, bin by bin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.geometry.fresnel import transmittance
+from pipeline.geometry.microfacet import rough_transmittance
+from pipeline.reconstruct.global_term.boundary_fit import EDGES, rough_boundary
+
+MIDDLE = 0.5 * (EDGES[1:] + EDGES[:-1])[2:]
+
+
+def seen(alpha: float, eta: float) -> np.ndarray:
+    """Of a surface, over what the smooth one of index 1.3 transmits."""
+    return rough_transmittance(MIDDLE, eta, alpha) / transmittance(MIDDLE, 1.3)
+
+
+@pytest.mark.parametrize(("alpha", "eta"), [(0.1, 1.3), (0.3, 1.3), (0.3, 1.6), (0.5, 1.45)])
+def test_the_curve_of_a_rough_surface_is_found(alpha: float, eta: float) -> None:
+    """Expected: within its stated errors where there are bins, and within a tenth down to a cosine of .05, below all
+    bins, in spite of the noise that normals make: a curve of bins alone would be constant there.
+    """
+    rng = np.random.default_rng(0)
+    slope = np.gradient(np.log(transmittance(np.linspace(0.001, 1, 1000), 1.3)), np.linspace(0.001, 1, 1000))
+    sigma = np.hypot(0.01, 0.03 * np.sqrt(1 - MIDDLE**2) * np.interp(MIDDLE, np.linspace(0.001, 1, 1000), slope))
+    for _ in range(5):
+        found = rough_boundary(1.3, MIDDLE, seen(alpha, eta) * np.exp(sigma * rng.standard_normal(len(MIDDLE))))
+        at = np.interp(MIDDLE, found.cosines, found.ratio)
+        np.testing.assert_allclose(at[MIDDLE > 0.3], seen(alpha, eta)[MIDDLE > 0.3], rtol=0.03)
+        low = np.array([0.05, 0.1])
+        true = rough_transmittance(low, eta, alpha) / transmittance(low, 1.3)
+        np.testing.assert_allclose(np.interp(low, found.cosines, found.ratio), true, rtol=0.2)
+
+
+def test_what_no_surface_does_is_not_believed() -> None:
+    """Rationale: light that hats smear around an edge showed up as twice the transmittance at a cosine of .2."""
+    wrong = seen(0.1, 1.3) * np.where(MIDDLE < 0.3, 1.8, 1.0)
+    found = rough_boundary(1.3, MIDDLE, wrong)
+    assert np.interp(0.2, found.cosines, found.ratio) < 1.4
+    np.testing.assert_allclose(np.interp(0.7, found.cosines, found.ratio), 1.0, atol=0.05)
+
+
+def test_levels_pass_through() -> None:
+    plain, twice = (rough_boundary(1.3, MIDDLE, k * seen(0.3, 1.3)) for k in (1.0, 2.0))
+    np.testing.assert_allclose(np.array(twice.ratio), 2.0 * np.array(plain.ratio), rtol=1e-4)
+
+
+def test_a_matched_boundary_and_too_few_bins_stay_smooth() -> None:
+    assert rough_boundary(1.0, MIDDLE, np.ones(len(MIDDLE))).ratio == (1.0,)
+    assert rough_boundary(1.3, MIDDLE[:2], np.ones(2)).ratio == (1.0,)
