@@ -35,8 +35,8 @@ def reflected(half: F64, difference: F64, entering: F64, leaving: F64, eta: floa
 def rough_transmittance(cosine: ArrayLike, eta: float, alpha: float) -> F64:
     """Share of light transmitted by the facets, for (K,) cosines between the mean normal and the direction outside.
 
-    By the midpoint rule over the facets that the direction sees (Heitz 2018), each weighted by what Fresnel lets through
-    and by the share of it that leaves unshadowed (eq. 21, 23); what facets pass to each other is lost.
+    By the midpoint rule over the facets that the direction sees (Heitz 2018), each weighted by what Fresnel lets
+    through and by the share of it that leaves unshadowed (eq. 21, 23); what facets pass to each other is lost.
     """
     c = np.maximum(np.asarray(cosine, np.float64), 1e-6)[:, None]
     s = np.sqrt(1.0 - c**2)

@@ -31,9 +31,7 @@ EDGES = np.array([0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.7
 SUPERSAMPLE = 3
 ALPHAS = np.geomspace(0.04, 0.64, 13)
 USUAL, USUAL_SPREAD = np.log(0.25), 0.7  # of log alpha, before the images say anything
-LINE_SPREAD = (
-    0.1  # of the slope of the line: what an index of 1.3 to 1.7, and light inside that is not diffuse, make it
-)
+LINE_SPREAD = 0.1  # of the line's slope: what an index of 1.3 to 1.7, and light inside that is not diffuse, make it
 NORMAL_ERROR = 0.05  # rad, of the scan's normals
 BIN_ERROR = 0.02  # relative, of a bin: what the model leaves of the sums
 OUTLIER = Huber(2.0)
