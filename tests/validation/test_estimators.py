@@ -37,7 +37,7 @@ def test_lobe_connection_is_unbiased(g: float, alpha: float) -> None:
     views = [camera(place, 13.0, 24) for place in VIEWS]
     images = []
     # The smoother, the rarer and the brighter the exits towards a camera, and the later their sums are normal.
-    few, many = (2_000, 12_000) if alpha > 0.1 else (4_000, 80_000)
+    few, many = (2_000, 12_000) if alpha > 0.1 else (4_000, 40_000)
     for lobe, walks in ((None, few), (CameraLobe(100.0, 0.0, 0.0), many)):
         transport = Transport(obj, cells=64, lobe=lobe)
         traced = transport.trace(beam(REPLICATES, **SPOT), REPLICATES, walks, seed=71, cameras=views, layers=2)
