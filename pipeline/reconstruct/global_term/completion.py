@@ -237,7 +237,9 @@ def complete(samples: Samples) -> RelightableModel:
         reflectance.astype(np.float32),
         measured,
         variance,
-        np.stack([fit.tilt.slope for fit in fits]) if tilted else None,
+        # Light goes on the way that it came: what the samples say against that is errors of places, which the fit has
+        # taken out of them.
+        np.stack([np.maximum(fit.tilt.slope, 0.0) for fit in fits]) if tilted else None,
         fits[0].tilt.distance if tilted else None,
     )
     provenance = {}
