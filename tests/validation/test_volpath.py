@@ -80,7 +80,7 @@ def test_agrees_with_stock_volpath(boundary: TwinBoundary, heterogeneous: bool, 
     """
     obj, camera = bumpy(boundary, heterogeneous), camera_of()
     light = Uniform() if kind == "uniform" else Directional(direction=(-0.7, 0.5, -0.5))
-    transport = Transport(obj)
+    transport = Transport(obj, cells=64)
     passes = 16
     spp = 128 if kind == "uniform" else 192
     theirs = blocks(volpath_images(obj, camera, light, tmp_path, passes, spp))
