@@ -26,6 +26,7 @@ REGISTRY = {
     "irradiance": "benchmarks.irradiance",
     "laser-safety": "benchmarks.laser_safety",
     "pareto": "benchmarks.pareto",
+    "reconstruct": "benchmarks.reconstruct",
     "references": "benchmarks.references",
     "regression": "benchmarks.regression",
     "resample": "benchmarks.resample",
