@@ -30,6 +30,7 @@ AROUND = (1.5, 4.0)  # edges from a spot, where its surroundings are read
 WHOLE = 0.5  # share of the beam whose vertices must have been read
 LEAST = 0.2  # of what is expected; a spot darker than that holds a fault
 FEWEST = 30  # spots
+MATCHED = 1e-3  # difference of the indices below which nothing is reflected
 BY_CHANCE = 1e-3  # probability with which samples without a reflection show one
 OUTLIER = Huber(2.0)  # standard deviations
 PROFILES = 2  # fits of the profile, each without the reflection found before
@@ -55,6 +56,8 @@ def fit_lobe(samples: Samples) -> SurfaceLobe:
 
     What is expected is a profile of the samples without the reflection: fitted twice, at first with it.
     """
+    if samples.eta - 1 < MATCHED:
+        return SurfaceLobe(because=f"of the assumed index, {samples.eta:g}, no light is reflected")
     grey, found = _grey(samples), SurfaceLobe()
     for _ in range(PROFILES):
         clean = replace(

@@ -100,6 +100,11 @@ def test_too_few_spots_say_so() -> None:
     assert "0 spots were read" in fit_lobe(replace(s, read_in_beams=BeamReadings.none())).because
 
 
+def test_a_matched_surface_reflects_nothing() -> None:
+    left = subtract_reflection(looked_at().with_readings(eta=1.0))
+    assert left.lobe is not None and "no light is reflected" in left.lobe.because
+
+
 def test_a_camera_behind_the_surface_sees_no_lobe() -> None:
     s = looked_at()
     seen = seen_by(s.glow[0].camera, s.spots, s.eta, 0.3)
