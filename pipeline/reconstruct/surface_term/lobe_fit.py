@@ -58,7 +58,10 @@ def fit_lobe(samples: Samples) -> SurfaceLobe:
     """
     if samples.eta - 1 < MATCHED:
         return SurfaceLobe(because=f"of the assumed index, {samples.eta:g}, no light is reflected")
-    grey, found = _grey(samples), SurfaceLobe()
+    grey, readings, found = _grey(samples), samples.read_in_beams, SurfaceLobe()
+    count = len(np.unique(readings.spot[grey.observed[readings.spot, readings.vertex]]))
+    if count < FEWEST:
+        return _too_few(count)
     for _ in range(PROFILES):
         clean = replace(
             grey, value=np.where(grey.observed, grey.value - found.strength * _added(samples, found.alpha), 0.0)
@@ -98,7 +101,7 @@ def _beyond(samples: Samples, grey: LaserSamples, expected: F64) -> SurfaceLobe:
     leaving, entering = power(expected * samples.cosine, near) / light, _incidence(samples)
     used = (shown > WHOLE) & (samples.spots.transmitted > 0) & (at_centre > LEAST) & (surroundings > LEAST)
     if used.sum() < FEWEST:
-        return SurfaceLobe(because=f"{used.sum()} spots were read where their beam met the object; {FEWEST} are needed")
+        return _too_few(int(used.sum()))
     others = np.column_stack([np.ones(count), np.log(np.maximum(surroundings, LEAST)), 1 - entering, 1 - leaving])[used]
     weight = area[readings.vertex] * near[readings.spot, readings.vertex] / light[readings.spot]
     unit = ((samples.eta - 1.0) / (samples.eta + 1.0)) ** 2  # of the assumed index, by which strengths are counted
@@ -123,6 +126,10 @@ def _beyond(samples: Samples, grey: LaserSamples, expected: F64) -> SurfaceLobe:
     strength_by = np.gradient([one.strength for one in tried], np.log(ALPHAS))
     error = float(np.hypot(best.error, spread * np.interp(log_alpha, np.log(ALPHAS), strength_by)))
     return SurfaceLobe(float(np.exp(log_alpha)), best.strength, error)
+
+
+def _too_few(spots: int) -> SurfaceLobe:
+    return SurfaceLobe(because=f"{spots} spots were read where their beam met the object; {FEWEST} are needed")
 
 
 def _incidence(samples: Samples) -> F64:
