@@ -156,16 +156,21 @@ def minimise(
 
 
 def likeliest(x: F64, cost: F64) -> tuple[float, float]:
-    """Where a parabola through the lowest of (n,) chi^2 and its neighbours is lowest, and the standard error.
+    """Where a parabola through the lowest of (n,) chi^2 and its neighbours is lowest, and the standard error there.
 
-    x: (n,) equally spaced values of an unknown that were all tried
+    x: (n,) equally spaced values of an unknown that were all tried, three or more. At an end of them, and where costs
+    do not bend upward, the lowest value itself and the error that the steeper rise beside it shows; never more than the
+    range that was tried. Raises: DiscoError for costs that are not finite.
     """
-    k = int(np.clip(np.argmin(cost), 1, len(cost) - 2))
-    step, low, high = x[1] - x[0], cost[k - 1] - cost[k], cost[k + 1] - cost[k]
-    if low + high <= 0:
-        return float(x[np.argmin(cost)]), float(x[-1] - x[0])
-    shift = np.clip(0.5 * (low - high) / (low + high), -1.0, 1.0)
-    return float(x[k] + shift * step), float(min(step * np.sqrt(2.0 / (low + high)), x[-1] - x[0]))
+    _finite(cost)
+    k, step, most = int(np.argmin(cost)), x[1] - x[0], x[-1] - x[0]
+    rises = [cost[j] - cost[k] for j in (k - 1, k + 1) if 0 <= j < len(cost)]
+    if len(rises) < 2 or sum(rises) <= 0:
+        steepest = max(rises)
+        return float(x[k]), float(min(step / np.sqrt(steepest), most) if steepest > 0 else most)
+    low, high = rises
+    shift = 0.5 * (low - high) / (low + high)
+    return float(x[k] + shift * step), float(min(step * np.sqrt(2.0 / (low + high)), most))
 
 
 def _finite(values: F64) -> F64:

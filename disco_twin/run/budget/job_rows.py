@@ -69,6 +69,7 @@ class JobRows:
             noise_per_signal=noise_per_signal(value, variance, own.spot_pairs.distance).astype(np.float32),
             oblique=np.zeros_like(own.oblique),
             tilt=np.zeros_like(own.tilt),
+            lobe=None,
             glow=(),
         )
         model, smooth = reconstruct(samples, self.method), Boundary(own.eta)

@@ -1,7 +1,7 @@
 """The boundary's transmittance at all angles, measured against that of the assumed index (F_t of thesis eq. 2.1).
 
 Samples come from views that are not too oblique. The same images show the surface at grazing angles too, where a rough
-one transmits up to five times what the smooth one of the assumed index does: most of a relit image's error near the
+one transmits several times what the smooth one of the assumed index does: most of a relit image's error near the
 outline. The images of all spots are summed and compared, by view cosine, with what the model expects. There normals
 that are off by a few degrees, and light that the model's hats smear around an edge, change the light as much as
 roughness does; so the curve is that of a GGX surface, whose roughness is fitted with a weight that knows the normals'
@@ -29,13 +29,14 @@ from pipeline.reconstruct.samples.samples import Samples, SpotSumImage
 
 EDGES = np.array([0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0 + 1e-9])
 SUPERSAMPLE = 3
-ALPHAS = np.geomspace(0.04, 0.64, 13)
-USUAL, USUAL_SPREAD = np.log(0.25), 0.7  # of log alpha, before the images say anything
+MATCHED = 1e-3  # difference of the indices below which all light passes
+ALPHAS = np.geomspace(0.02, 0.64, 16)
+USUAL, USUAL_SPREAD = np.log(0.2), 1.2  # of log alpha, before the images say anything
 LINE_SPREAD = 0.1  # of the line's slope: what an index of 1.3 to 1.7, and light inside that is not diffuse, make it
-NORMAL_ERROR = 0.05  # rad, of the scan's normals
+NORMAL_ERROR = 0.03  # rad, that the scan's normals have in common at one view cosine
 BIN_ERROR = 0.02  # relative, of a bin: what the model leaves of the sums
 OUTLIER = Huber(2.0)
-CURVE = np.concatenate([[0.0, 0.01, 0.02, 0.035], np.linspace(0.05, 1.0, 20)])  # cosines of the curve's corners
+CURVE = np.concatenate([[0.0], np.geomspace(0.002, 0.05, 8), np.linspace(0.1, 1.0, 19)])  # cosines of its corners
 
 
 @dataclass(frozen=True)
@@ -95,9 +96,12 @@ def measure_boundary(
 
 
 def rough_boundary(eta: float, cosines: F64, ratio: F64) -> Boundary:
-    """The boundary whose transmittance over the smooth one is (K,) `ratio` at (K,) cosines, within their errors."""
-    known = (ratio > 0) & (cosines > 0)
-    if known.sum() < 3 or eta - 1 < 1e-3:  # a matched boundary transmits all light
+    """The boundary whose transmittance over the smooth one is (K,) `ratio` at (K,) cosines, within their errors.
+
+    Smooth where too few bins are known.
+    """
+    known = (ratio > 0) & (cosines > 0) & np.isfinite(ratio)
+    if known.sum() < 3 or eta - 1 < MATCHED:
         return Boundary(eta)
     c, measured = cosines[known], np.log(ratio[known])
     slope = np.gradient(np.log(transmittance(np.stack([c - 0.01, c, c + 0.01]), eta)), 0.01, axis=0)[1]

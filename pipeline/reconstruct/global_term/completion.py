@@ -106,8 +106,8 @@ class Fit:
     """One laser's smooth model.
 
     entries: (V, V) R_d, symmetric and positive; at_spots: (S, V) the same between beams and vertices; both in mm^-2,
-    means over all directions; tilt: how single directions depart from them; tilt_chi2: its slopes' squares by their
-    covariance; field: (n, n) Y
+    means over all directions; tilt: how single directions depart from them; tilt_chi2: squares of the slopes that are
+    relit, by their covariance; field: (n, n) Y
     """
 
     entries: F64
@@ -115,6 +115,14 @@ class Fit:
     tilt: TiltLaw
     tilt_chi2: float
     field: F32
+
+
+def forward(slopes: F64) -> F64:
+    """The slopes that are relit: light goes on the way that it came, so none is below 0. What samples say against that
+    is errors of places; the fit has taken them out of the samples, and the images that a boundary is measured on hold
+    them as well.
+    """
+    return np.maximum(slopes, 0.0)
 
 
 def fit_laser(samples: Samples, laser: int, field: SymmetricField, start: F32) -> Fit:
@@ -135,7 +143,8 @@ def fit_laser(samples: Samples, laser: int, field: SymmetricField, start: F32) -
     kernel = vertex_pairs.mean(found.profile)
     exponent = deviation(vertex_pairs.distance / edge) * (field.vertices @ y @ field.vertices.T)
     entries = 0.5 * (kernel + kernel.T) * np.exp(0.5 * (exponent + exponent.T))
-    known = float(found.tilt.slope @ np.linalg.solve(found.covariance, found.tilt.slope))
+    kept = forward(found.tilt.slope)
+    known = float(kept @ np.linalg.solve(found.covariance, kept))
     return Fit(entries, pairs.mean(found.profile) * np.exp(smooth), found.tilt, known, y)
 
 
@@ -223,7 +232,7 @@ def complete(samples: Samples) -> RelightableModel:
         distance = samples.spot_pairs.distance
         reflected = np.zeros_like(distance)  # the images still hold it
         if samples.lobe is not None and not samples.lobe.because:
-            reflected = samples.lobe.strength * samples.beams.in_view(view.camera, samples.lobe.alpha).toarray()
+            reflected = samples.lobe.in_view(samples.beams, view.camera)
         return np.stack([fit.at_spots * fit.tilt.factor(distance, tilt) + reflected for fit in fits])
 
     measured_ratio = measure_boundary(samples.mesh, samples.eta, samples.glow, expected)
@@ -237,9 +246,7 @@ def complete(samples: Samples) -> RelightableModel:
         reflectance.astype(np.float32),
         measured,
         variance,
-        # Light goes on the way that it came: what the samples say against that is errors of places, which the fit has
-        # taken out of them.
-        np.stack([np.maximum(fit.tilt.slope, 0.0) for fit in fits]) if tilted else None,
+        np.stack([forward(fit.tilt.slope) for fit in fits]) if tilted else None,
         fits[0].tilt.distance if tilted else None,
     )
     provenance = {}

@@ -51,7 +51,8 @@ class Samples:
     """Measured R_d between spots and vertices.
 
     values: (L, S, V) mm^-2, NaN where not observed; averaged over the hat function of the vertex and over the beam
-    dark_variance, noise_per_signal: (L, S, V); an entry of expectation m has variance dark + per_signal * m
+    dark_variance, noise_per_signal: (L, S, V); an entry of expectation m has variance dark + per_signal * m; dark holds
+        what a reflection that was taken off leaves open, too
     oblique: (S, V) relative variance that obliqueness adds at both ends (`oblique_variance`)
     tilt: (S, V) sum of `tilts` at both ends, mean over the cameras
     cosine: (S, V) between normal and direction to the camera, mean over the cameras; 0 where not observed
@@ -79,7 +80,12 @@ class Samples:
         return float(self.mesh.edges_unique_length.mean())
 
     def with_readings(self, **fields: Any) -> Samples:
-        """Other readings of the same spots and vertices: what was prepared from where those lie stays."""
+        """Other readings of the same spots and vertices: what was prepared from where those lie stays.
+
+        Raises: ValueError for other spots or another mesh.
+        """
+        if not fields.keys().isdisjoint({"mesh", "spots"}):
+            raise ValueError("spots and mesh are what readings are of: make new samples instead")
         of_places = ("edge", "spot_pairs", "lit", "vertex_pairs")
         other = replace(self, **fields)
         vars(other).update({name: made for name, made in vars(self).items() if name in of_places})

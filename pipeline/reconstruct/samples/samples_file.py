@@ -67,8 +67,13 @@ def load_samples(path: Path) -> Samples:
             spots=spots,
             glow=tuple(views),
             read_in_beams=BeamReadings(**{name: arrays[name] for name in _READ}),
-            lobe=None if given_lobe is None else SurfaceLobe(**given_lobe),
+            lobe=None if given_lobe is None else _lobe(**given_lobe),
             **own,
         )
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"is damaged ({error})", file=path, remedy=remedy) from error
+
+
+def _lobe(alphas: list[float], strengths: list[float], error: float, because: str) -> SurfaceLobe:
+    """From JSON, which has lists."""
+    return SurfaceLobe(tuple(alphas), tuple(strengths), error, because)

@@ -20,12 +20,14 @@ from pipeline.geometry.fresnel import transmittance
 from pipeline.geometry.microfacet import reflected
 from pipeline.reconstruct.samples.spots import Spots
 
-LEAST_COSINE = 0.1  # of a view to the surface, below which no reading is taken
+LEAST_COSINE = 0.02  # of a view to the surface, below which neither F_t nor the lobe is known
 
 
 @dataclass(frozen=True)
 class BeamReadings:
-    """Readings of vertices that a beam meets: (K,) spot, vertex and view, and the weight of the view in the sample."""
+    """Readings of vertices that a beam meets: (K,) spot, vertex and view, and the weight of the view in the sample,
+    mean over the lasers.
+    """
 
     spot: I64
     vertex: I64
@@ -37,22 +39,6 @@ class BeamReadings:
         """No vertex was read where a beam met it."""
         nothing = np.zeros(0, np.int64)
         return cls(nothing, nothing, nothing, np.zeros(0))
-
-
-@dataclass(frozen=True)
-class SurfaceLobe:
-    """alpha: GGX roughness; strength: of the reflection, in units of that of the assumed index; error: its standard
-    error; because: why nothing is taken off the samples
-    """
-
-    alpha: float = 0.0
-    strength: float = 0.0
-    error: float = 0.0
-    because: str = ""
-
-    def described(self, eta: float) -> str:
-        """In words; eta: the assumed index."""
-        return f"GGX alpha {self.alpha:.2f}, {self.strength:.2f}({self.error:.2f}) times that of index {eta:g}"
 
 
 def seen_by(camera: PinholeCamera, spots: Spots, eta: float, alpha: float) -> F64:
@@ -90,3 +76,41 @@ class BeamOnHats:
         at_spots = np.array([seen_by(camera, self.spots, self.eta, alpha) for camera in self.cameras])
         r = self.readings
         return np.asarray(r.weight * at_spots[r.view, r.spot] * self.density[r.spot, r.vertex])
+
+
+@dataclass(frozen=True)
+class SurfaceLobe:
+    """A reflection as a sum of GGX lobes.
+
+    alphas: (A,) their roughness; strengths: (A,) in units of the reflection of the assumed index; error: standard error
+    of the strengths' sum; because: why nothing is taken off the samples
+    """
+
+    alphas: tuple[float, ...] = ()
+    strengths: tuple[float, ...] = ()
+    error: float = 0.0
+    because: str = ""
+
+    @property
+    def strength(self) -> float:
+        """Of all lobes together."""
+        return float(sum(self.strengths))
+
+    @property
+    def alpha(self) -> float:
+        """Mean roughness, by strength."""
+        return float(np.dot(self.alphas, self.strengths)) / max(self.strength, 1e-30)
+
+    def described(self, eta: float) -> str:
+        """In words; eta: the assumed index."""
+        return f"GGX alpha {self.alpha:.2f}, {self.strength:.2f}({self.error:.2f}) times that of index {eta:g}"
+
+    def in_samples(self, beams: BeamOnHats) -> F64:
+        """(K,) mm^-2, what is added to the samples of the pairs in `beams.readings`."""
+        parts = [s * beams.in_samples(a) for a, s in zip(self.alphas, self.strengths, strict=True)]
+        return np.asarray(sum(parts, np.zeros(len(beams.readings.spot))))
+
+    def in_view(self, beams: BeamOnHats, camera: PinholeCamera) -> F64:
+        """(S, V) mm^-2, what is added to what one camera sees."""
+        parts = [s * beams.in_view(camera, a) for a, s in zip(self.alphas, self.strengths, strict=True)]
+        return np.asarray(sum(parts, sparse.csr_array(beams.density.shape)).toarray())

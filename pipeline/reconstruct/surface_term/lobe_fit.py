@@ -6,46 +6,53 @@ surroundings are, a few edges away, is known from samples that no reflection rea
     log (near - strength * lobe(alpha)) = a + b log around + c (1 - cos in) + d (1 - cos out) + scatter,
 
 each relative to the profile's expectation; c and d hold what rough boundaries let through, which is no lobe. All alphas
-are tried. The strength is free within what transparent solids have: the index is an assumption, and of an index of 1.6
-three times as much is reflected as of 1.3. What is not there beyond chance is left out.
+and strengths are tried, and each counts by its likelihood. The strength is free within what translucent solids have:
+the index is an assumption, and of an index of 1.6 three times as much is reflected as of 1.3. What is not there beyond
+chance is left out.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
 
 from hw.base.arrays import F64, Bool
-from pipeline.calibrate.least_squares import Huber, Prior, likeliest, minimise
+from pipeline.calibrate.least_squares import Huber
 from pipeline.geometry.mesh import RayMesh
+from pipeline.reconstruct.global_term.boundary_fit import MATCHED
 from pipeline.reconstruct.global_term.radial_profile import LaserSamples, fit_profile
 from pipeline.reconstruct.samples.samples import Samples
 from pipeline.reconstruct.samples.surface_lobe import SurfaceLobe
 
 ALPHAS = np.geomspace(0.05, 0.5, 15)  # a wider lobe cannot be told from what the boundary lets through
-NORMAL, NORMAL_SPREAD = 0.042, 0.025  # reflectance of transparent solids at normal incidence (indices 1.3 to 1.7)
+REFLECTANCES = np.linspace(0.0, 0.12, 49)  # at normal incidence, that are tried
+NORMAL, NORMAL_SPREAD = 0.035, 0.015  # those of translucent solids and liquids: indices of 1.3 to 1.6
 AROUND = (1.5, 4.0)  # edges from a spot, where its surroundings are read
 WHOLE = 0.5  # share of the beam whose vertices must have been read
 LEAST = 0.2  # of what is expected; a spot darker than that holds a fault
 FEWEST = 30  # spots
-MATCHED = 1e-3  # difference of the indices below which nothing is reflected
-BY_CHANCE = 1e-3  # probability with which samples without a reflection show one
+BY_CHANCE = 1e-5  # probability with which samples without a reflection show one; angles that are no lobe's gain less
 OUTLIER = Huber(2.0)  # standard deviations
+ROUNDS = 8  # of weights
 PROFILES = 2  # fits of the profile, each without the reflection found before
 SHAPE = 0.2  # relative: by how much a surface's lobe may differ from the fitted one
 
 
 def subtract_reflection(samples: Samples) -> Samples:
-    """The samples without what the surface reflects, and with what that leaves open in their variance."""
+    """The samples without what the surface reflects, and with what that leaves open in their variance.
+
+    What it leaves open is one error for all spots, and is added to every sample's own variance: sums of samples come
+    out a little too sure. `glow` keeps the reflection, since images do. Raises: DiscoError as `fit_lobe`.
+    """
     lobe = fit_lobe(samples)
     if lobe.because:
         return samples.with_readings(lobe=lobe)
-    one = _added(samples, lobe.alpha)
-    open_part = (lobe.error**2 + (SHAPE * lobe.strength) ** 2) * one**2
+    reflected = _added(samples, lobe)
+    open_part = ((lobe.error / lobe.strength) ** 2 + SHAPE**2) * reflected**2
     return samples.with_readings(
-        values=(samples.values - lobe.strength * one).astype(np.float32),
+        values=(samples.values - reflected).astype(np.float32),
         dark_variance=(samples.dark_variance + open_part).astype(np.float32),
         lobe=lobe,
     )
@@ -54,7 +61,8 @@ def subtract_reflection(samples: Samples) -> Samples:
 def fit_lobe(samples: Samples) -> SurfaceLobe:
     """Roughness and strength of the reflection; wavelengths together, since they share the surface.
 
-    What is expected is a profile of the samples without the reflection: fitted twice, at first with it.
+    What is expected is a profile of the samples without the reflection: fitted twice, at first with it. Raises:
+    DiscoError where values are not finite.
     """
     if samples.eta - 1 < MATCHED:
         return SurfaceLobe(because=f"of the assumed index, {samples.eta:g}, no light is reflected")
@@ -63,9 +71,8 @@ def fit_lobe(samples: Samples) -> SurfaceLobe:
     if count < FEWEST:
         return _too_few(count)
     for _ in range(PROFILES):
-        clean = replace(
-            grey, value=np.where(grey.observed, grey.value - found.strength * _added(samples, found.alpha), 0.0)
-        )
+        reflected = _added(samples, found)
+        clean = replace(grey, value=np.where(grey.observed, grey.value - reflected, 0.0))
         fit = fit_profile(samples.spot_pairs, clean, samples.edge, samples.tilt)
         expected = samples.spot_pairs.mean(fit.profile) * fit.tilt.factor(samples.spot_pairs.distance, samples.tilt)
         found = _beyond(samples, grey, expected)
@@ -74,11 +81,10 @@ def fit_lobe(samples: Samples) -> SurfaceLobe:
     return found
 
 
-def _added(samples: Samples, alpha: float) -> F64:
-    """(S, V) mm^-2, what a lobe of strength 1 adds to the samples; 0 for alpha 0."""
+def _added(samples: Samples, lobe: SurfaceLobe) -> F64:
+    """(S, V) mm^-2, what a lobe adds to the samples."""
     out, readings = np.zeros(samples.values.shape[1:]), samples.read_in_beams
-    if alpha > 0:
-        np.add.at(out, (readings.spot, readings.vertex), samples.beams.in_samples(alpha))
+    np.add.at(out, (readings.spot, readings.vertex), lobe.in_samples(samples.beams))
     return out
 
 
@@ -105,27 +111,20 @@ def _beyond(samples: Samples, grey: LaserSamples, expected: F64) -> SurfaceLobe:
     others = np.column_stack([np.ones(count), np.log(np.maximum(surroundings, LEAST)), 1 - entering, 1 - leaving])[used]
     weight = area[readings.vertex] * near[readings.spot, readings.vertex] / light[readings.spot]
     unit = ((samples.eta - 1.0) / (samples.eta + 1.0)) ** 2  # of the assumed index, by which strengths are counted
-    centres, strengths = at_centre[used], (NORMAL / unit, NORMAL_SPREAD / unit)
-    plain = np.linalg.lstsq(others, np.log(centres), rcond=None)[0]
-
-    def with_alpha(alpha: float, scatter: float) -> _Regression:
-        lobe = np.bincount(readings.spot, beams.in_samples(alpha) * weight, count)[used].astype(np.float64)
-        return _regress(centres, others, lobe, strengths, plain, scatter)
-
-    left = np.log(centres) - others @ plain
-    for _ in range(2):  # the first time the reflection itself is part of the scatter
-        scatter = max(1.4826 * float(np.median(np.abs(left))), 1e-3)
-        tried = [with_alpha(alpha, scatter) for alpha in ALPHAS]
-        log_alpha, spread = likeliest(np.log(ALPHAS), -np.array([one.gain for one in tried]))
-        best = with_alpha(float(np.exp(log_alpha)), scatter)
-        left = best.left
+    strengths = REFLECTANCES / unit
+    lobes = [np.bincount(readings.spot, beams.in_samples(a) * weight, count)[used].astype(np.float64) for a in ALPHAS]
+    cost, gain = _tried(at_centre[used], others, lobes, strengths)
     limit = float(chi2.ppf(1 - BY_CHANCE, 2))
-    if best.gain <= limit:
+    if gain <= limit:
         why = f"spots are no brighter toward the mirror direction beyond their scatter (chi^2 at most {limit:.0f})"
         return SurfaceLobe(because=why)
-    strength_by = np.gradient([one.strength for one in tried], np.log(ALPHAS))
-    error = float(np.hypot(best.error, spread * np.interp(log_alpha, np.log(ALPHAS), strength_by)))
-    return SurfaceLobe(float(np.exp(log_alpha)), best.strength, error)
+    cost = cost + ((REFLECTANCES - NORMAL) / NORMAL_SPREAD) ** 2
+    share = np.exp(-0.5 * (cost - cost.min()))
+    share /= share.sum()
+    mean = float((share * strengths).sum())
+    error = float(np.sqrt((share * (strengths - mean) ** 2).sum()))
+    kept = share @ strengths  # of each alpha, by what it is worth
+    return SurfaceLobe(tuple(map(float, ALPHAS)), tuple(map(float, kept)), error)
 
 
 def _too_few(spots: int) -> SurfaceLobe:
@@ -138,8 +137,9 @@ def _incidence(samples: Samples) -> F64:
 
 
 def _grey(samples: Samples) -> LaserSamples:
-    """Means over the lasers, where all were observed."""
-    each = [LaserSamples.of(samples, laser) for laser in range(len(samples.values))]
+    """Means over the lasers that saw anything, where all of them did."""
+    all_lasers = [LaserSamples.of(samples, laser) for laser in range(len(samples.values))]
+    each = [one for one in all_lasers if one.observed.any()] or all_lasers[:1]
     observed = np.logical_and.reduce([one.observed for one in each])
     n = len(each)
     value, dark, noise = (
@@ -149,37 +149,39 @@ def _grey(samples: Samples) -> LaserSamples:
     return LaserSamples(value, observed, dark, noise, each[0].oblique, each[0].edges)
 
 
-@dataclass(frozen=True)
-class _Regression:
-    """strength; error: its standard error; gain: by how much chi^2 is less than without a lobe, 0 where the strength is
-    not above 0; left: (S,) of the logarithms
+def _tried(near: F64, smooth: F64, lobes: list[F64], strengths: F64) -> tuple[F64, float]:
+    """(A, K) -2 log likelihood of every alpha and strength, and by how much the least is below that of no lobe.
+
+    near: (S,); smooth: (S, 4) of what the logarithm of near - strength * lobe is linear in; lobes: A of (S,);
+    strengths: (K,), the first 0
     """
+    scatter = _scatter(np.log(near) - smooth @ np.linalg.lstsq(smooth, np.log(near), rcond=None)[0])
+    for _ in range(2):  # the first time the reflection itself is part of the scatter
+        found = [_costs(near, smooth, lobe, strengths, scatter) for lobe in lobes]
+        cost = np.stack([c for c, _ in found])
+        alpha, strength = np.unravel_index(int(np.argmin(cost)), cost.shape)
+        scatter = _scatter(found[int(alpha)][1][int(strength)])
+    return cost, float(cost[0, 0] - cost.min())
 
-    strength: float
-    error: float
-    gain: float
-    left: F64
+
+def _scatter(left: F64) -> float:
+    """Standard deviation, from the median, of what is left."""
+    return max(1.4826 * float(np.median(np.abs(left))), 1e-3)
 
 
-def _regress(
-    near: F64, smooth: F64, lobe: F64, strengths: tuple[float, float], start: F64, scatter: float
-) -> _Regression:
-    """near, lobe: (S,); smooth: (S, 4) of what the logarithm of the rest is linear in; strengths: mean and spread of
-    those there are; start: (4,) without a lobe; scatter: of the logarithms.
+def _costs(near: F64, smooth: F64, lobe: F64, strengths: F64, scatter: float) -> tuple[F64, F64]:
+    """(K,) -2 log likelihood with robust weights, and (K, S) what is left of the logarithms.
+
+    What scatters is the light from below the surface, so its density in `near` has 1 / (near - strength * lobe) in it;
+    without that, a lobe would be found too weak.
     """
-    n, (mean, spread) = smooth.shape[1], strengths
-
-    def left(x: F64) -> F64:
-        rest = np.maximum(near - x[n] * lobe, 0.1 * near)
-        return np.asarray((np.log(rest) - smooth @ x[:n]) / scatter)
-
-    def cost(x: F64) -> float:
-        return float(OUTLIER.cost(left(x)).sum() + ((x[n] - mean) / spread) ** 2)
-
-    prior = Prior(np.append(np.zeros(n), mean), np.diag(np.append(np.full(n, 1e-6), spread**-2)))
-    bare = minimise(lambda x: left(np.append(x, 0.0)), start, Prior(np.zeros(n), 1e-6 * np.eye(n)), loss=OUTLIER)
-    without, found = np.append(bare.value, 0.0), minimise(left, np.append(start, 0.0), prior, loss=OUTLIER)
-    strength, error = float(found.value[n]), float(np.sqrt(found.covariance[n, n]))
-    if strength <= 0:
-        return _Regression(0.0, error, 0.0, scatter * left(without))
-    return _Regression(strength, error, cost(without) - cost(found.value), scatter * left(found.value))
+    rest = np.maximum(near - strengths[:, None] * lobe, 0.1 * near)
+    target: F64 = np.log(rest)
+    left, weight = target, np.ones_like(target)
+    for _ in range(ROUNDS):
+        normal = (smooth.T * weight[:, None]) @ smooth + 1e-9 * len(near) * np.eye(smooth.shape[1])
+        right = (smooth.T * (weight * target)[:, None]).sum(axis=2)
+        left = np.asarray(target - np.linalg.solve(normal, right[..., None])[..., 0] @ smooth.T, np.float64)
+        weight = OUTLIER.weight(left.ravel() / scatter).reshape(left.shape)
+    cost = OUTLIER.cost(left.ravel() / scatter).reshape(left.shape).sum(axis=1) + 2 * np.log(rest / near).sum(axis=1)
+    return np.asarray(cost), np.asarray(left)

@@ -99,8 +99,8 @@ def test_a_perfect_scan_is_left_as_it_is() -> None:
 
 
 def test_a_bump_on_a_balls_scan_is_taken_off() -> None:
-    """A ball's scan has a bump of .25 mm on the outline of a view: two thirds and more of it go; elsewhere a tenth of
-    it is the most that comes."""
+    """A ball's scan has a bump of .25 mm on the outline of a view: two thirds and more of it go; elsewhere the rms is a
+    tenth of it at most."""
     ball = trimesh.creation.icosphere(4, 16.0)
     seen = silhouettes(4, ball)
     sight = seen.truth[0].pose[:3, :3]

@@ -19,8 +19,8 @@ def seen(alpha: float, eta: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("alpha", "eta"), [(0.1, 1.3), (0.3, 1.3), (0.3, 1.6), (0.5, 1.45)])
 def test_the_curve_of_a_rough_surface_is_found(alpha: float, eta: float) -> None:
-    """Expected: within its stated errors where there are bins, and within a tenth down to a cosine of .05, below all
-    bins, in spite of the noise that normals make: a curve of bins alone would be constant there.
+    """Expected: within a bin's error and a half where there are bins; within a third (two errors of normals) down to a
+    cosine of .05, below all bins: a curve of bins alone would be constant there.
     """
     rng = np.random.default_rng(0)
     slope = np.gradient(np.log(transmittance(np.linspace(0.001, 1, 1000), 1.3)), np.linspace(0.001, 1, 1000))
@@ -31,7 +31,7 @@ def test_the_curve_of_a_rough_surface_is_found(alpha: float, eta: float) -> None
         np.testing.assert_allclose(at[MIDDLE > 0.3], seen(alpha, eta)[MIDDLE > 0.3], rtol=0.03)
         low = np.array([0.05, 0.1])
         true = rough_transmittance(low, eta, alpha) / transmittance(low, 1.3)
-        np.testing.assert_allclose(np.interp(low, found.cosines, found.ratio), true, rtol=0.2)
+        np.testing.assert_allclose(np.interp(low, found.cosines, found.ratio), true, rtol=0.34)
 
 
 def test_what_no_surface_does_is_not_believed() -> None:
@@ -40,6 +40,18 @@ def test_what_no_surface_does_is_not_believed() -> None:
     found = rough_boundary(1.3, MIDDLE, wrong)
     assert np.interp(0.2, found.cosines, found.ratio) < 1.4
     np.testing.assert_allclose(np.interp(0.7, found.cosines, found.ratio), 1.0, atol=0.05)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.02, 0.05])
+def test_a_nearly_smooth_surface_is_not_made_rough(alpha: float) -> None:
+    """Rationale: bins without noise of a surface that the prior does not expect. Expected: within a tenth where most
+    pixels are, within a quarter at a cosine of .1, which a normal's error of 2 degrees explains.
+    """
+    exact = np.ones(len(MIDDLE)) if alpha == 0 else seen(alpha, 1.3)
+    found = rough_boundary(1.3, MIDDLE, exact)
+    np.testing.assert_allclose(np.interp(MIDDLE, found.cosines, found.ratio)[1:], exact[1:], rtol=0.1)
+    own = 1.0 if alpha == 0 else float(rough_transmittance(np.array([0.1]), 1.3, alpha)[0] / transmittance(0.1, 1.3))
+    assert np.interp(0.1, found.cosines, found.ratio) / own < 1.25
 
 
 def test_levels_pass_through() -> None:

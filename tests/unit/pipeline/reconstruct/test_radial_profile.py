@@ -141,3 +141,6 @@ def test_an_object_without_a_tilt_is_left_alone() -> None:
     leaning = replace(s, tilt=tilt, values=s.values * (1 + 0.3 * tilt).astype(np.float32))
     (term,) = complete(leaning).terms
     np.testing.assert_allclose(term.tilt[0, 1:5], 0.3, atol=0.1)
+    backward = complete(replace(s, tilt=tilt, values=s.values * (1 - 0.3 * tilt).astype(np.float32)))
+    assert backward.terms[0].tilt is None  # no light goes back: errors of places are fitted, and not relit
+    assert "without angular moments" in backward.provenance
