@@ -61,7 +61,7 @@ class Truth:
     def load(cls, path: Path) -> Truth:
         """Read what `save` wrote. Raises: InputError for a missing or damaged file, and for another format version."""
         names = (*ARRAYS, *(f"balance_{k}" for k in EnergyBalance.__dataclass_fields__))
-        _, data = load_arrays(path, FORMAT_VERSION, "delete it, disco-twin run computes it again", names)
+        _, data = load_arrays(path, FORMAT_VERSION, "disco-twin run computes it again once it is deleted", names)
         balance = EnergyBalance(**{k: data[f"balance_{k}"] for k in EnergyBalance.__dataclass_fields__})
         return cls(data["columns"], data["replicates"], data["area"], balance)
 

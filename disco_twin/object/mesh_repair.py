@@ -23,6 +23,7 @@ from hw.base.errors import DiscoError, InputError
 from hw.base.files import write_atomically
 from pipeline.geometry.mesh_file import LARGEST_MM, SMALLEST_MM, load_mesh
 
+LOOKED_AT = 200  # vertices of a body, to see whether it lies inside another one
 LEAST_SHARE = 0.01  # of the largest piece's area, below which a piece is dropped
 MOST_PIECES = 200  # beyond which there are no pieces, but triangles that have lost each other
 CRACK = 1 / 30  # of the size: pieces whose borders come nearer are one body
@@ -82,7 +83,7 @@ def mend(path: Path, out: Path, size_mm: float | None) -> Mended:
     old = load_mesh(path)
     kept, repeated, dropped, share = _pieces(old, path)
     mended, holes = zip(*(_closed(body, path) for body in _bodies(kept)), strict=True)
-    whole = trimesh.util.concatenate(_oriented(mended))
+    whole = trimesh.util.concatenate(_oriented(mended, path))
     scale = 1.0 if size_mm is None else size_mm / float(whole.extents.max())
     shift = np.zeros(3) if size_mm is None else -scale * whole.bounds.mean(axis=0)
     placed = (scale * np.asarray(whole.vertices) + shift).astype(np.float32)  # as the file holds them
@@ -207,10 +208,15 @@ def _closed(pieces: list[trimesh.Trimesh], path: Path) -> tuple[trimesh.Trimesh,
     return trimesh.Trimesh(vertices, faces, process=False), holes
 
 
-def _oriented(parts: Sequence[trimesh.Trimesh]) -> list[trimesh.Trimesh]:
-    """Outward, or inward where one lies inside another: a cavity."""
+def _oriented(parts: Sequence[trimesh.Trimesh], path: Path) -> list[trimesh.Trimesh]:
+    """Outward, or inward where one lies inside another: a cavity. Raises: InputError for bodies that overlap."""
     for part in parts:
-        around = sum(bool(other.contains(part.vertices[:1])[0]) for other in parts if other is not part)
+        points, around = np.asarray(part.vertices)[:: max(1, len(part.vertices) // LOOKED_AT)], 0
+        for other in parts:
+            inside = np.asarray(other.contains(points)) if other is not part else np.zeros(1, bool)
+            if inside.any() and not inside.all():
+                raise InputError("two of its bodies overlap", file=path, remedy=BY_VOXELS)
+            around += bool(inside.all())
         if (part.volume < 0) != (around % 2 == 1):
             part.invert()
     return list(parts)

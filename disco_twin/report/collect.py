@@ -78,6 +78,7 @@ def impulses(rig: RigConfig, capture: Path, sensor: Sensor) -> tuple[list[list[I
     columns: list[list[Impulse]] = []
     damaged: list[str] = []
     with StreamReader(capture) as stream:
+        stream.require_complete()
         plan = stream.plan
         for spot in np.unique(np.linspace(0, len(plan.spots) - 1, SPOTS_SHOWN).astype(int)):
             angle, column = plan.spots[spot].angle, []

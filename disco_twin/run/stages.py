@@ -49,7 +49,11 @@ OUTPUTS = {  # files that a finished stage leaves, as patterns in the run folder
     "capture": CAPTURE,
     "truth": ("twin/truth.npz",),
     "references": REFERENCES,
-    "pipeline": ("work/pipeline.json", "work/model-*.npz", "work/request.json", "work/relit*/*/*.npy"),
+    "pipeline": (
+        *(f"work/{name}" for name in ("pipeline.json", "request.json", "calibration.json", "samples.npz")),
+        "work/model-*.npz",
+        "work/relit*/*/*.npy",
+    ),
     "scores": ("twin/scores.json",),
 }
 CONTINUED = {  # files that interrupted work is continued from

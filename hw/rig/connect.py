@@ -217,8 +217,10 @@ def open_camera(file: DevicesFile, device: GenicamDevice, shape: tuple[int, int]
     from hw.camera.genicam import CameraError, GenicamCamera
     from hw.camera.viva_grabber import VivaGrabber
 
-    assert file.sensor is not None  # the rig file's own check
     table = f"cameras[{file.cameras.index(device)}]"
+    if file.sensor is None or not isinstance(device, GenicamDevice):  # the rig file's own check: no sensor, no camera
+        raise InputError("is simulated, and none can be opened", file=file.path, key=table,
+                         remedy="name a GenICam camera, and its [sensor]")  # fmt: skip
     try:
         grabber = VivaGrabber(device.address, device.pixel_format, shape, serial=device.serial)
         camera = GenicamCamera(device.name, grabber, file.sensor.bracket(), shape)

@@ -194,7 +194,7 @@ class Calibration(Strict):
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read what `save` wrote. Raises: InputError where it is missing, damaged or of another format version."""
-        return read_json(path, cls, "calibrate again")
+        return read_json(path, cls, "reconstruct again, which calibrates first")
 
 
 @lru_cache(maxsize=32)

@@ -109,6 +109,18 @@ def test_a_crack_all_around_is_closed(tmp_path: Path) -> None:
     assert read_mesh(tmp_path / "out.ply").volume == pytest.approx(PEBBLE.volume, rel=0.01)
 
 
+def test_bodies_that_overlap_are_refused(tmp_path: Path) -> None:
+    """Rationale: two balls, their middles half a radius apart; turning one inward made an object without volume."""
+    one = trimesh.creation.icosphere(3, 20.0)
+    two = one.copy()
+    two.apply_translation([10.0, 0.0, 0.0])
+    trimesh.util.concatenate([one, two]).export(tmp_path / "two.ply")
+    with pytest.raises(InputError, match="overlap") as refused:
+        mend(tmp_path / "two.ply", tmp_path / "out.ply", None)
+    assert "voxels" in str(refused.value)
+    assert not (tmp_path / "out.ply").exists()
+
+
 def test_many_bodies_are_kept_and_triangles_that_have_lost_each_other_are_refused(tmp_path: Path) -> None:
     """Each of 120 boxes has less than a hundredth of the area; a soup of triangles has no two that share an edge."""
     pytest.importorskip("pymeshfix")
@@ -142,7 +154,7 @@ def test_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         with pytest.raises(DiscoError, match=r"needs pymeshfix. Remedy: pip install 'disco-twin\[mesh\]'"):
             mend(source, tmp_path / "out.ply", None)
     trimesh.util.concatenate([ball(), ball(at=15.0).apply_translation([0, 1.5, 0])]).export(tmp_path / "two.ply")
-    with pytest.raises(InputError, match=r"two\.ply: mended, the mesh intersects itself.*voxels"):
+    with pytest.raises(InputError, match=r"two\.ply: two of its bodies overlap.*voxels"):
         mend(tmp_path / "two.ply", tmp_path / "out.ply", None)
     assert source.read_bytes() == before and not (tmp_path / "out.ply").exists()
 
