@@ -167,12 +167,19 @@ def sample_figures(outputs: StageOutputs, true: TrueRun) -> dict[str, float]:
 
 
 def completion_figures(outputs: StageOutputs, true: TrueRun) -> dict[str, float]:
-    """Entries by decade; a column's total is the light that leaves anywhere per light that arrives over its vertex."""
+    """Entries by decade; a column's total is the light that leaves anywhere per light that arrives over its vertex. The
+    bias of totals counts with its standard error: one that happens to be next to nothing is no better than that.
+    """
     truth, exitance = true.truth, outputs.exitance
     figures = _by_decade("completion", exitance, truth.mean, truth.standard_error)
     for name, chosen in {"lit": outputs.lit, "unlit": ~outputs.lit}.items():
         score = score_totals(exitance @ truth.area, truth, chosen)
-        bias = [math.log10(x) if x is not None and x > 0 else math.inf for x in score.mean]
+        bias = [
+            math.hypot(math.log10(x), error / x / math.log(10))
+            if x is not None and error is not None and x > 0
+            else math.inf
+            for x, error in zip(score.mean, score.mean_se, strict=True)
+        ]
         spread = [math.inf if x is None else x for x in score.spread]
         figures[f"completion/{name} totals log10 bias"] = float(np.mean(bias))
         figures[f"completion/{name} totals spread"] = float(np.mean(spread))
