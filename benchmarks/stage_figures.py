@@ -174,16 +174,19 @@ def completion_figures(outputs: StageOutputs, true: TrueRun) -> dict[str, float]
     figures = _by_decade("completion", exitance, truth.mean, truth.standard_error)
     for name, chosen in {"lit": outputs.lit, "unlit": ~outputs.lit}.items():
         score = score_totals(exitance @ truth.area, truth, chosen)
-        bias = [
-            math.hypot(math.log10(x), error / x / math.log(10))
-            if x is not None and error is not None and x > 0
-            else math.inf
-            for x, error in zip(score.mean, score.mean_se, strict=True)
-        ]
+        bias = [_with_error(x, error) for x, error in zip(score.mean, score.mean_se, strict=True)]
         spread = [math.inf if x is None else x for x in score.spread]
         figures[f"completion/{name} totals log10 bias"] = float(np.mean(bias))
         figures[f"completion/{name} totals spread"] = float(np.mean(spread))
     return figures
+
+
+def _with_error(mean: float | None, error: float | None) -> float:
+    """log10 of a mean ratio, grown by its standard error; its sign stays."""
+    if mean is None or error is None or mean <= 0:
+        return math.inf
+    bias = math.log10(mean)
+    return math.copysign(math.hypot(bias, error / mean / math.log(10)), bias)
 
 
 def relit_figures(outputs: StageOutputs, true: TrueRun) -> dict[str, float]:

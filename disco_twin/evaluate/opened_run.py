@@ -133,7 +133,9 @@ class OpenedRun:
 
     @cached_property
     def samples(self) -> xr.Dataset:
-        """Measured R_d from spots to vertices, NaN where no camera saw the vertex, and where both lie."""
+        """Measured R_d from spots to vertices, NaN where no camera saw the vertex, and where both lie. What the surface
+        reflects has been taken off where it was found.
+        """
         given = self.method_input
         entry, place = "laser spot vertex", "spot axis"
         arrays = {
