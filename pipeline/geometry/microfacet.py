@@ -48,9 +48,8 @@ def rough_transmittance(cosine: ArrayLike, eta: float, alpha: float) -> F64:
     across, up = radius * np.cos(turn), radius * np.sin(turn)
     up = 0.5 * (1.0 - z) * np.sqrt(1.0 - across**2) + 0.5 * (1.0 + z) * up
     towards = np.sqrt(np.maximum(1.0 - across**2 - up**2, 0.0))
-    facet = np.stack(
-        [alpha * (x * towards - z * up), alpha * across + 0.0 * up, np.maximum(x * up + z * towards, 1e-9)]
-    )
+    upward = np.maximum(x * up + z * towards, 1e-9)
+    facet = np.stack([alpha * (x * towards - z * up), np.broadcast_to(alpha * across, up.shape), upward])
     facet /= np.linalg.norm(facet, axis=0)
     own = s * facet[0] + c * facet[2]
     within = np.sqrt(1.0 - (1.0 - own**2) / eta**2)
