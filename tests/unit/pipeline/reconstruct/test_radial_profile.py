@@ -114,6 +114,29 @@ def test_tilt_has_the_sign_of_the_view() -> None:
     np.testing.assert_array_equal(np.sign(at_spots[1, near]), -np.sign(x[near]))
 
 
+def test_tilts_of_samples_are_reciprocal() -> None:
+    """Rationale: spots on two vertices, lit and seen from far away, then each lit from where the other's camera was:
+    light takes the same way back, so the sample has the same tilt, the law's only direction.
+    """
+    s, rng = make(spots=2).samples, np.random.default_rng(6)
+    points, normals = np.asarray(s.mesh.vertices), np.asarray(s.mesh.vertex_normals)
+    for _ in range(20):
+        at = rng.choice(len(points), 2, replace=False)
+        travel, towards = (x / np.linalg.norm(x) for x in rng.standard_normal((2, 3)))
+
+        def tilt(way: list[int], direction: np.ndarray, eye: np.ndarray, at: np.ndarray = at) -> float:
+            ends = at[way]
+            spots = replace(
+                s.spots, position=points[ends], normal=normals[ends], direction=np.stack([direction] * 2)
+            )
+            leaving, entering = tilts(s.mesh, spots, 1e9 * eye, 1.3)
+            return float((leaving + entering)[0, ends[1]])
+
+        there = tilt([0, 1], travel, towards)
+        assert tilt([1, 0], -towards, -travel) == pytest.approx(there, abs=1e-7)
+        assert tilt([0, 1], -travel, -towards) == pytest.approx(-there, abs=1e-7)
+
+
 def test_slopes_are_found_with_honest_errors() -> None:
     """Rationale: samples with a known law and known noise, forty times. Expected: z of the slopes about 1, no bias."""
     made = make(spots=60, noise=0.0, contrast=0.0, hidden=0.2)
