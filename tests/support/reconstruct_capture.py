@@ -27,6 +27,11 @@ def reflectance(distance: np.ndarray, laser: int) -> np.ndarray:
     return np.asarray((0.004 - 0.001 * laser) * np.exp(-distance / 6.0))
 
 
+def pattern(points: np.ndarray) -> np.ndarray:
+    """(N,) factor of R_d at either end; tests put one in its place."""
+    return np.ones(len(points))
+
+
 def rig() -> RigConfig:
     """Two cameras, two turntable angles, two lasers."""
     common = {"width": 96, "height": 80, "focal_length_mm": 20.0, "pixel_pitch_um": 20.0}
@@ -68,7 +73,7 @@ def images(calibration: Calibration, plan: Plan, address: ImageAddress, boundary
     at = o + d * (-(o @ d) - np.sqrt((o @ d) ** 2 - o @ o + RADIUS**2))
     entering = transmittance(-(at / RADIUS) @ d, boundary) * POWER[address.laser]
     leaving = transmittance(-(normal * directions).sum(axis=1), boundary)
-    r = reflectance(np.linalg.norm(points - at, axis=1), address.laser)
+    r = reflectance(np.linalg.norm(points - at, axis=1), address.laser) * pattern(points) * pattern(at[None])
     out = np.where(hit, leaving / np.pi * r * entering, 0.0)
     return np.asarray(out.reshape(camera.height, camera.width))
 

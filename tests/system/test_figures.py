@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytestmark = pytest.mark.slow
@@ -38,6 +39,18 @@ def test_relit_images_meet_the_references(ideal: dict[str, Any]) -> None:
             assert abs(row["energy_ratio"] - 1) <= 0.05, row
         if row["light"] == "edge":
             assert row["nrmse"] <= 0.15, row
+
+
+def test_faults_never_help(ideal: dict[str, Any]) -> None:
+    """Rationale: what the calibration takes for granted is true of this rig. Expected behaviour: no image is worse than
+    the committed one of a rig with every fault, beyond the spread over captures: three deviations of ten of them.
+    """
+    committed = json.loads((Path(__file__).parents[1] / "regression" / "figures.json").read_text())
+    for row in ideal["relit"]:
+        if row["method"] == "default":
+            name = f"relit/{row['light']}@{row['view']} nrmse"
+            spread = np.std([figures[name] for figures in committed["fresh"]], ddof=1)
+            assert row["nrmse"] <= committed["figures"][name]["frozen"] + 3 * spread, name
 
 
 def test_an_ideal_rig_needs_no_calibration(ideal: dict[str, Any]) -> None:

@@ -109,8 +109,9 @@ def test_the_law_of_directions_against_exact_light() -> None:
 
     Expected behaviour, l a transport mean free path: without absorption the displacement of a beam is exact at every
     angle; absorption of a thousandth takes 1 to 5 % off. Of the light that leaves in one direction it is right to 12 %
-    where both cosines are above .4; light that leaves at a cosine of .05 has gone little more than half as far. That light leaves alike in all directions
-    (eq. 2.1) is right to 6 % where both cosines are above .5, and a factor of two too dark where both graze.
+    where both cosines are above .4; light that leaves at a cosine of .05 has gone little more than half as far. That
+    light leaves alike in all directions (eq. 2.1) is right to 6 % where both cosines are above .5, and a factor of two
+    too dark where both graze.
     """
     free_path = 1.0
     r = np.geomspace(1e-4, 60.0, 40_000)
@@ -126,7 +127,7 @@ def test_the_law_of_directions_against_exact_light() -> None:
     sine, white, pale = np.sqrt(1 - upper**2), HFunction.of(1.0), HFunction.of(0.999)
     np.testing.assert_allclose(white.displacement(upper), free_path * sine, rtol=1e-12)
     taken_off = 1 - pale.displacement(upper) / sine
-    assert 0 < taken_off.min() and taken_off[upper > 0.15].min() > 0.005 and taken_off.max() < 0.055
+    assert taken_off.min() > 0 and taken_off[upper > 0.15].min() > 0.005 and taken_off.max() < 0.055
     pairs = white.displacement_to(above[:, None], above) / np.sqrt(1 - above**2)[:, None]
     assert np.abs(pairs - 1).max() < 0.125
     assert 0.5 < float(white.displacement_to(0.5, 0.05) / np.sqrt(0.75)) < 0.6

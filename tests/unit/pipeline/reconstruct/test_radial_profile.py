@@ -126,9 +126,7 @@ def test_tilts_of_samples_are_reciprocal() -> None:
 
         def tilt(way: list[int], direction: np.ndarray, eye: np.ndarray, at: np.ndarray = at) -> float:
             ends = at[way]
-            spots = replace(
-                s.spots, position=points[ends], normal=normals[ends], direction=np.stack([direction] * 2)
-            )
+            spots = replace(s.spots, position=points[ends], normal=normals[ends], direction=np.stack([direction] * 2))
             leaving, entering = tilts(s.mesh, spots, 1e9 * eye, 1.3)
             return float((leaving + entering)[0, ends[1]])
 
