@@ -132,9 +132,9 @@ def test_relit_objects_are_reciprocal() -> None:
     angular term does at the exit what it does at the entry. Light is projected onto hat functions at the entry and
     interpolated at the exit, which differ in second order: the difference falls to a quarter per refinement.
 
-    Expected behaviour: extrapolated by that, both ways are equal to two thousandths (the fourth order is a sixteenth of
-    the coarse mesh's difference, which is .018 at most). The term itself changes what is seen by a twelfth to an eighth;
-    with one sign at the entry and the other at the exit the ways differ by as much.
+    Expected behaviour: extrapolated by that, both ways are equal to two thousandths: the fourth order is a sixteenth of
+    the coarse mesh's difference, .018 at most. The term itself changes what is seen by a twelfth to an eighth; with one
+    sign at the entry and the other at the exit the ways differ by as much.
     """
     rng, models = np.random.default_rng(3), [flattened(2), flattened(3)]
     turns = [x / np.linalg.norm(x, axis=1, keepdims=True) for x in rng.standard_normal((4, 2, 3))]
