@@ -5,6 +5,9 @@ completion   all entries of R_d by decade below the peak, against the number of 
 lobe         the reflection that is found in samples that one was added to, against the number of spots: relative error
              of what is taken off
 boundary     the transmittance of a rough surface, against the number of facets: largest absolute error
+medium       light that diffuses from point to point of the ball, against the number of its vertices: log10 of elements
+             over spherical harmonics more than 8 mm away, root mean square
+exchange     light between two facing squares, against the number of directions: relative error of their form factor
 
 The ball has R_d(x, y) = a(x) a(y) f(|x - y|) with a narrow and a wide exponential and a smooth a; samples carry 3 %
 noise and a third of the surface is hidden from each third of the spots. Two cameras look at every spot.
@@ -17,14 +20,19 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from numpy.polynomial.legendre import legval
+from scipy.special import spherical_in
 
 from hw.base.arrays import F64
+from pipeline.geometry import mesh as geometry
 from pipeline.geometry import microfacet
 from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.fresnel import mean_transmittance
 from pipeline.geometry.mesh import RayMesh
 from pipeline.geometry.microfacet import rough_transmittance
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.reconstruct.global_term.completion import complete
+from pipeline.reconstruct.medium.diffusion import Diffusion
 from pipeline.reconstruct.samples.distances import vertex_pairs
 from pipeline.reconstruct.samples.samples import Samples, SpotSumImage
 from pipeline.reconstruct.samples.spots import Spots
@@ -34,6 +42,8 @@ from pipeline.reconstruct.surface_term.lobe_fit import subtract_reflection
 RADIUS, BEAM, ETA, NOISE, HIDDEN, CONTRAST = 10.0, 0.5, 1.3, 0.03, 0.33, 0.2
 ALPHA, STRENGTH = 0.3, 2.5  # of the lobe that is added
 DECADES = 3
+DIFFUSIVITY, ABSORPTION, FAR_MM = 0.4, 0.004, 8.0  # mm, 1/mm, mm
+FACING = 0.19982  # form factor of squares as far apart as they are wide (Howell's catalogue, C-11)
 
 
 def kernel(distance: F64) -> F64:
@@ -130,11 +140,60 @@ def boundary(facets: int, fine: F64) -> dict[str, Any]:
     return {"seconds": seconds, "error": error, "settings": {"facets": facets}, "value": value}
 
 
+def medium(subdivisions: int) -> dict[str, Any]:
+    """Fluence rates between all vertices."""
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS)
+    start = time.perf_counter()
+    elements = Diffusion.of(mesh, ETA)
+    light = elements.hats @ (elements.hats @ elements.between(DIFFUSIVITY, ABSORPTION)).T
+    seconds = time.perf_counter() - start
+    unit = np.asarray(mesh.vertices) / RADIUS
+    cosine = np.clip(unit @ unit.T, -1.0, 1.0)
+    far = RADIUS * np.sqrt(2.0 - 2.0 * cosine) > FAR_MM
+    t = mean_transmittance(ETA) / ETA**2
+    error = np.log10(light[far] / series(cosine[far], t / (2.0 * (2.0 - t))))
+    return {"seconds": seconds, "error": float(np.sqrt((error**2).mean())), "settings": {"vertices": len(unit)}}
+
+
+def series(cosine: F64, leaving: float) -> F64:
+    """Fluence rate on the ball per flux into a point of it, by orders of spherical harmonics; the point spreads over a
+    twentieth of the radius.
+    """
+    order, kappa = np.arange(200), np.sqrt(ABSORPTION / DIFFUSIVITY)
+    inside, slope = (spherical_in(order, kappa * RADIUS, derivative=d) for d in (False, True))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        own = kappa * slope / inside
+    own = np.where(np.isfinite(own) & (inside > 0), own, order / RADIUS)  # where both underflow
+    spread = np.exp(-order * (order + 1) * 0.05**2 / 2)
+    weight = (2 * order + 1) / (4 * np.pi * RADIUS**2) * spread / (DIFFUSIVITY * own + leaving)
+    return np.asarray(legval(cosine, weight))
+
+
+def exchange(directions: int) -> dict[str, Any]:
+    """Two slabs of 10 mm, 10 mm apart."""
+    slabs = []
+    for z in (-6.0, 6.0):
+        slab = trimesh.creation.box((10.0, 10.0, 2.0)).subdivide().subdivide()
+        slab.apply_translation((0.0, 0.0, z))
+        slabs.append(slab)
+    kept = geometry.EXCHANGE_DIRECTIONS
+    try:
+        geometry.EXCHANGE_DIRECTIONS = directions
+        start = time.perf_counter()
+        total = float(RayMesh.of(trimesh.util.concatenate(slabs)).exchange.sum())
+        seconds = time.perf_counter() - start
+    finally:
+        geometry.EXCHANGE_DIRECTIONS = kept
+    return {"seconds": seconds, "error": abs(total / 200.0 / FACING - 1.0), "settings": {"directions": directions}}
+
+
 def run(quick: bool = False) -> dict[str, Any]:
     """Curves {name, points: [{seconds, error, settings}]}."""
     spots, meshes = ((30, 120), (2,)) if quick else ((15, 30, 75, 150, 300, 600), (2, 3))
     curves = [{"name": f"completion {10 * 4**n + 2}", "points": [completion(n, s) for s in spots]} for n in meshes]
     curves.append({"name": "lobe", "points": [lobe(meshes[-1], s) for s in spots if s >= 75]})
+    curves.append({"name": "medium", "points": [medium(n) for n in ((2,) if quick else (1, 2, 3, 4))]})
+    curves.append({"name": "exchange", "points": [exchange(4**n) for n in range(1, 4 if quick else 6)]})
     fine = boundary(256 if quick else 768, np.zeros(0))["value"]
     points = [boundary(n, fine) for n in (12, 24, 48, 96)]
     curves.append({"name": "boundary", "points": [{k: v for k, v in p.items() if k != "value"} for p in points]})

@@ -14,8 +14,10 @@ import trimesh
 from scipy import sparse
 
 from hw.base.arrays import F64, I64, Bool
+from pipeline.geometry.directions import cosine_directions
 
 CREASE = np.cos(np.deg2rad(30.0))  # between a vertex's normal and a triangle's
+EXCHANGE_DIRECTIONS = 64  # from each of a triangle's three points
 _OFFSET = 1e-5  # of the mesh's size: shadow rays start this far above the face, far beyond embree's float32
 
 
@@ -128,6 +130,33 @@ class RayMesh:
         """(V,) integral of each vertex's hat function in mm^2; they add up to the mesh's area."""
         share = np.repeat(self.areas / 3.0, 3)
         return np.bincount(self.faces.ravel(), share, minlength=self.vertices).astype(np.float64)
+
+    @cached_property
+    def exchange(self) -> sparse.csr_array:
+        """(V, V) mm^2: of light that leaves one hat function diffusely, with an exitance of 1, the flux that meets the
+        mesh again in the other one (Goral et al. 1984); symmetric, nothing on a convex mesh.
+        """
+        middles = 0.5 * (1.0 - np.eye(3))  # of edges: a rule of degree 2
+        ask, total = np.flatnonzero(~self.free), sparse.csr_array((self.vertices, self.vertices))
+        share = self.areas[ask] / (3.0 * EXCHANGE_DIRECTIONS)
+        many = np.repeat(ask, EXCHANGE_DIRECTIONS)
+        for k, barycentric in enumerate(np.broadcast_to(m, (len(ask), 3)) for m in middles):
+            towards = cosine_directions(self.normals[ask], EXCHANGE_DIRECTIONS, 3 * ask + k).reshape(-1, 3)
+            origins = np.repeat(self.points(ask, barycentric), EXCHANGE_DIRECTIONS, axis=0)
+            hit = self.first_hit(origins + _OFFSET * self.size * self.normals[many], towards)
+            rays = np.flatnonzero(hit.triangle >= 0)
+            rays = rays[_dot(self.normals[hit.triangle[rays]], towards[rays]) < 0]  # nothing enters from behind
+            arrives = self.interpolation(hit.triangle[rays], hit.barycentric[rays])
+            leaves = self.interpolation(many[rays], np.broadcast_to(middles[k], (len(rays), 3)))
+            total = total + leaves.T @ (arrives * np.repeat(share, EXCHANGE_DIRECTIONS)[rays, None])
+        return sparse.csr_array(0.5 * (total + total.T))
+
+    @cached_property
+    def open_areas(self) -> F64:
+        """(V,) integral of each vertex's hat function in mm^2, times the share of light leaving it diffusely that meets
+        the mesh nowhere else: the vertex areas on a convex mesh.
+        """
+        return np.asarray(self.vertex_areas - self.exchange.sum(axis=1))
 
     @cached_property
     def mass_matrix(self) -> sparse.csc_array:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pipeline.calibrate.calibration import Calibration
 from pipeline.geometry.mesh import RayMesh
-from pipeline.reconstruct.global_term.radial_profile import LaserSamples
+from pipeline.reconstruct.samples.laser_samples import LaserSamples
 from pipeline.reconstruct.samples.samples import Samples
 
 LOCAL_SHARE = 0.99  # of the observed light within one edge: nothing is left for a global term

@@ -11,10 +11,8 @@ import numpy as np
 from hw.base.arrays import F64
 from hw.base.errors import InputError
 from pipeline.geometry.camera import look_at
+from pipeline.geometry.directions import about, cosine_directions, lattice
 from pipeline.relight.lights import Beam, Directional, Environment, Light, TexturedProjector, Uniform
-
-_GOLDEN = 0.6180339887498949  # turns from one direction to the next: a Fibonacci lattice
-_SHIFT = 0.7548776662466927  # turns from one point's lattice to the next point's, so that their errors average out
 
 
 def colour(light: Uniform | Directional | Beam | TexturedProjector, lasers: int) -> F64:
@@ -100,38 +98,19 @@ def from_many_directions(light: Uniform | Environment, normals: F64, count: int,
     """
     if isinstance(light, Uniform):
         light = Environment(constant=tuple(light.radiance * x for x in light.colour), name=light.name)
-    index = np.arange(len(normals))[:, None]
-    first = np.broadcast_to((np.arange(count) + 0.5) / count, (len(normals), count))  # middles of strata
-    azimuth = 2 * np.pi * ((np.arange(count) * _GOLDEN + index * _SHIFT) % 1.0)
-    sets = []
+    index, sets = np.arange(len(normals)), []
+    first, azimuth = lattice(index, count)
     constant = _first(light.constant, lasers, light.name)
     if constant.any():
-        cosine = np.sqrt(1 - first)  # density cos/pi about the normal
-        directions = _about(normals, cosine, azimuth)
-        sets.append((directions, np.broadcast_to(constant[:, None, None] * np.pi / count, (lasers, *cosine.shape))))
+        weight = np.broadcast_to(constant[:, None, None] * np.pi / count, (lasers, *first.shape))
+        sets.append((cosine_directions(normals, count, index), weight))
     for lobe in light.lobes:
         kappa = lobe.sharpness
         away = -np.log1p(first * np.expm1(-2 * kappa)) / kappa  # 1 - cosine, density of von Mises and Fisher
         axis = np.broadcast_to(_unit(lobe.direction), normals.shape)
-        directions = _about(axis, 1 - away, azimuth)
+        directions = about(axis, 1 - away, azimuth)
         solid_angle = -2 * np.pi * np.expm1(-2 * kappa) / kappa  # integral of exp(kappa (cos - 1))
         seen = np.maximum(np.einsum("nkx,nx->nk", directions, normals), 0.0)
         radiance = _first(lobe.radiance, lasers, light.name)
         sets.append((directions, radiance[:, None, None] * (seen * solid_angle / count)))
     return sets
-
-
-def _about(axes: F64, cosine: F64, azimuth: F64) -> F64:
-    """(N, 3) unit axes, (N, K) cosines and azimuths about them -> (N, K, 3) unit directions (Duff et al. 2017)."""
-    x, y, z = axes.T
-    sign = np.where(z >= 0, 1.0, -1.0)
-    a = -1 / (sign + z)
-    b = x * y * a
-    u = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
-    v = np.stack([b, sign + y * y * a, -y], axis=1)
-    sine = np.sqrt(np.maximum(0.0, 1 - cosine**2))
-    return np.asarray(
-        cosine[..., None] * axes[:, None]
-        + (sine * np.cos(azimuth))[..., None] * u[:, None]
-        + (sine * np.sin(azimuth))[..., None] * v[:, None]
-    )

@@ -1,7 +1,8 @@
 """The default method: every entry of the symmetric V x V matrix from the columns at the spots.
 
-R_d(x_i, x_o) = [mean of f(distance) over the patches] * exp(s(distance) G(x_i, x_o)), where f is the radial profile of
-all samples, s the size of what it leaves unexplained, and G a smooth symmetric function on pairs of surface points.
+R_d(x_i, x_o) = [mean of f(distance) over the patches] * exp(m(x_i, x_o) + s(distance) G(x_i, x_o)), where f is the
+radial profile of all samples, m what a homogeneous medium of the scan's shape adds to it, s the size of what both leave
+unexplained, and G a smooth symmetric function on pairs of surface points.
 G solves one symmetric positive definite system: the samples at the spots' barycentric points bind columns and, by
 reciprocity, rows; smoothness over the surface on both sides fills the rest. Values are compared with their expectation
 linearly and weighted by precision (`LaserSamples.residual`), so that a noisy tail neither dominates nor turns negative.
@@ -27,27 +28,23 @@ from pipeline.model.relightable import WITHOUT, RelightableModel
 from pipeline.model.tilt import TiltLaw
 from pipeline.reconstruct.global_term.boundary_fit import measure_boundary, of_mean_one
 from pipeline.reconstruct.global_term.harmonics import Harmonics, harmonics
-from pipeline.reconstruct.global_term.radial_profile import TILT_EDGES, LaserSamples, ProfileFit, fit_profile
+from pipeline.reconstruct.global_term.prior import FAR, deviation, medium_priors
+from pipeline.reconstruct.global_term.radial_profile import TILT_EDGES, ProfileFit, fit_profile
 from pipeline.reconstruct.global_term.totals import steady_totals
+from pipeline.reconstruct.medium.medium_fit import MediumPrior
+from pipeline.reconstruct.samples.laser_samples import LaserSamples
 from pipeline.reconstruct.samples.samples import ANGULAR, Samples, SpotSumImage
 from pipeline.reconstruct.samples.spots import tilts
 
 log = logging.getLogger(__name__)
 
-# Chosen by leaving a fifth of the spots out, without the truth (docs/decisions/0013); lengths in edges of the scan.
-RANGE_EDGES = 2.0  # correlation length of G
-NEAR, FAR, TURN_EDGES = 0.08, 0.6, 3.6  # s(distance): relative deviation of R_d from the profile
+RANGE_EDGES = 2.0  # of the scan: correlation length of G, chosen by leaving spots out (docs/decisions/0013)
 BOTH_ENDS = 2 * ANGULAR**2  # relative variance of any entry that directions leave, in and out
 ROUNDS = 2  # of Gauss-Newton, for each of as many fits of the profile
 TOLERANCE = 1e-3  # of conjugate gradients: what is left stays below the stated errors (docs/decisions/0083)
 MOST_STEPS = 300
 MOST_HARMONICS = 500
 TILT_BY_CHANCE = 1e-3  # probability with which samples without a tilt show one
-
-
-def deviation(edges: F64) -> F64:
-    """s: standard deviation of log R_d about the radial profile, by distance in edges."""
-    return np.asarray(NEAR + (FAR - NEAR) * -np.expm1(-((edges / TURN_EDGES) ** 2)))
 
 
 @dataclass(frozen=True)
@@ -125,27 +122,34 @@ def forward(slopes: F64) -> F64:
     return np.maximum(slopes, 0.0)
 
 
-def fit_laser(samples: Samples, laser: int, field: SymmetricField, start: F32) -> Fit:
-    """The profile and the field in turn. start: (n, n) first guess of Y, the laser's before."""
+def fit_laser(
+    samples: Samples, laser: int, field: SymmetricField, start: F32, far: float, medium: MediumPrior | None = None
+) -> Fit:
+    """The profile and the field in turn. start: (n, n) first guess of Y, the laser's before; far: how much log R_d
+    departs from its prior far from a spot.
+    """
     pairs, vertex_pairs, measured = samples.spot_pairs, samples.vertex_pairs, LaserSamples.of(samples, laser)
     edge = samples.edge
-    scale, y = deviation(measured.edges), start
+    scale, y = deviation(measured.edges, far), start
+    known: F64 | float = 0.0 if medium is None else medium.at_spots
     found: ProfileFit | None = None
-    smooth = scale * field.at_spots(y)
+    smooth = known + scale * field.at_spots(y)
     for _ in range(ROUNDS):
         found = fit_profile(pairs, measured, edge, samples.tilt, smooth, found)
         prior = pairs.mean(found.profile) * found.tilt.factor(pairs.distance, samples.tilt)
         for _ in range(ROUNDS):
             relative, weight = measured.residual(prior * np.exp(smooth))
-            y = field.solve(relative + smooth, weight, scale, y)
-            smooth = scale * field.at_spots(y)
+            y = field.solve(relative + smooth - known, weight, scale, y)
+            smooth = known + scale * field.at_spots(y)
     found = fit_profile(pairs, measured, edge, samples.tilt, smooth, found)
     kernel = vertex_pairs.mean(found.profile)
-    exponent = deviation(vertex_pairs.distance / edge) * (field.vertices @ y @ field.vertices.T)
+    exponent = deviation(vertex_pairs.distance / edge, far) * (field.vertices @ y @ field.vertices.T)
+    if medium is not None:
+        exponent = exponent + medium.departures
     entries = 0.5 * (kernel + kernel.T) * np.exp(0.5 * (exponent + exponent.T))
     kept = forward(found.tilt.slope)
-    known = float(kept @ np.linalg.solve(found.covariance, kept))
-    return Fit(entries, pairs.mean(found.profile) * np.exp(smooth), found.tilt, known, y)
+    shown = float(kept @ np.linalg.solve(found.covariance, kept))
+    return Fit(entries, pairs.mean(found.profile) * np.exp(smooth), found.tilt, shown, y)
 
 
 def hold_measured(
@@ -216,11 +220,13 @@ def complete(samples: Samples) -> RelightableModel:
     edge = samples.edge
     basis = harmonics(samples.mesh, MOST_HARMONICS)
     field = SymmetricField.of(basis, samples.lit, RANGE_EDGES * edge)
+    media, far, no_medium = medium_priors(samples)
     fits: list[Fit] = []
     for laser in range(len(samples.values)):
-        fits.append(fit_laser(samples, laser, field, fits[-1].field if fits else np.zeros_like(field.penalty)))
+        start = fits[-1].field if fits else np.zeros_like(field.penalty)
+        fits.append(fit_laser(samples, laser, field, start, far, media[laser] if media else None))
     edges = samples.vertex_pairs.distance / edge
-    prior_variance = deviation(edges) ** 2 * unexplained(samples, basis, RANGE_EDGES * edge)
+    prior_variance = deviation(edges, far) ** 2 * unexplained(samples, basis, RANGE_EDGES * edge)
     # What is left open about log R_d raises the expectation of R_d: the mean of a log-normal.
     reflectance, relative, measured = hold_measured(
         samples, fits, np.exp(0.5 * prior_variance), prior_variance + BOTH_ENDS
@@ -237,8 +243,9 @@ def complete(samples: Samples) -> RelightableModel:
 
     measured_ratio = measure_boundary(samples.mesh, samples.eta, samples.glow, expected)
     boundary = of_mean_one(measured_ratio, samples, np.stack([fit.at_spots for fit in fits]))
-    area, level = RayMesh.of(samples.mesh).vertex_areas, boundary.mean_transmittance**2
-    reflectance = steady_totals(reflectance, relative, area, level, basis, edge)
+    leaves, level = RayMesh.of(samples.mesh).open_areas, boundary.mean_transmittance**2
+    expected_totals = np.stack([medium.totals for medium in media]) if media else None
+    reflectance = steady_totals(reflectance, relative, leaves, level, basis, edge, expected_totals)
     variance = (reflectance**2 * (relative + BOTH_ENDS)).astype(np.float32)
     limit = float(chi2.ppf(1 - TILT_BY_CHANCE, len(TILT_EDGES)))
     tilted = max(fit.tilt_chi2 for fit in fits) > limit
@@ -252,6 +259,8 @@ def complete(samples: Samples) -> RelightableModel:
     provenance = {}
     if samples.lobe is not None and not samples.lobe.because:
         provenance["taken off"] = f"the surface's reflection, {samples.lobe.described(samples.eta)}"
+    if no_medium:
+        provenance[f"{WITHOUT}medium"] = no_medium
     if not tilted:
         why = f"samples show no change with direction beyond their noise (chi^2 at most {limit:.0f})"
         provenance[f"{WITHOUT}angular moments"] = why

@@ -9,6 +9,7 @@ column alike, so that R_d stays symmetric and its sums meet those totals (docs/d
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from itertools import product
 
@@ -19,30 +20,35 @@ from scipy.stats import norm
 from hw.base.arrays import F64
 from pipeline.reconstruct.global_term.harmonics import Harmonics
 
+log = logging.getLogger(__name__)
+
 RANGES = (1.5, 2.5, 4.0, 6.0, 10.0)  # edges: correlation lengths that are tried
-DEVIATIONS = (0.02, 0.04, 0.08, 0.16, 0.32)  # of the totals' logarithms over the surface, likewise
+DEVIATIONS = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32)  # of the totals' logarithms over the surface, likewise
 COMMON = (0.02, 0.04, 0.08)  # what the samples of one spot have in common, likewise
+SHARED, SHARED_RANGE = 0.08, 6.0  # what errors of scan and poses do to totals, and over how many edges alike
 ENOUGH = 1e-4  # relative change of a factor at which the scaling ends
 STEPS = 200
 
 
 @dataclass(frozen=True)
 class Kriging:
-    """A Gaussian field z = mean + U a, a ~ N(0, diag(spectrum)), observed with (V,) noise variances.
+    """A Gaussian field z = mean + U a, a ~ N(0, diag(spectrum)), observed with an error U b, b ~ N(0, diag(shared)),
+    that is smooth itself, and with noise of (V,) variances.
 
-    functions: (V, n) U; spectrum: (n,); noise: (V,)
+    functions: (V, n) U; spectrum, shared: (n,); noise: (V,)
     """
 
     functions: F64
     spectrum: F64
+    shared: F64
     noise: F64
 
     def posterior(self, observed: F64) -> tuple[F64, F64, float]:
-        """(V,) mean and variance of z given the observations (Rasmussen & Williams 2006, eq. 2.11, 2.12; its mean by
+        """(V,) mean and variance of z given the observations (Rasmussen & Williams 2006, eq. 2.25, 2.26; its mean by
         generalised least squares), and the logarithm of their likelihood, but for a constant.
         """
-        weighted = self.functions / self.noise[:, None]
-        factor = cho_factor(self.functions.T @ weighted + np.diag(1.0 / self.spectrum))
+        weighted, both = self.functions / self.noise[:, None], self.spectrum + self.shared
+        factor = cho_factor(self.functions.T @ weighted + np.diag(1.0 / both))
 
         def whitened(x: F64) -> F64:
             return np.asarray(x / self.noise - weighted @ cho_solve(factor, weighted.T @ x))
@@ -51,40 +57,61 @@ class Kriging:
         level = float((whitened(one) @ observed) / (whitened(one) @ one))
         pull = whitened(observed - level)
         mean = level + self.functions @ (self.spectrum * (self.functions.T @ pull))
-        variance = (self.functions * cho_solve(factor, self.functions.T).T).sum(axis=1)
-        size = 2 * np.log(np.diag(factor[0])).sum() + np.log(self.spectrum).sum() + np.log(self.noise).sum()
+        # Of a + b the observations leave the inverse of what was factored; a is its share of that, and what b hides.
+        part = self.functions * (self.spectrum / both)
+        variance = (part * cho_solve(factor, part.T).T).sum(axis=1)
+        variance += (self.functions**2 * (self.spectrum * self.shared / both)).sum(axis=1)
+        size = 2 * np.log(np.diag(factor[0])).sum() + np.log(both).sum() + np.log(self.noise).sum()
         return np.asarray(mean), np.asarray(variance), float(-0.5 * ((observed - level) @ pull + size))
 
 
 def steady_totals(
-    reflectance: F64, variance: F64, area: F64, exitance_per_flux: float, basis: Harmonics, edge: float
+    reflectance: F64,
+    variance: F64,
+    open_area: F64,
+    exitance_per_flux: float,
+    basis: Harmonics,
+    edge: float,
+    expected: F64 | None = None,
 ) -> F64:
     """(L, V, V) R_d whose column totals are steadied, symmetric as before.
 
-    reflectance: (L, V, V) mm^-2; variance: relative, of what the fill leaves open; area: (V,) mm^2 of the hats;
-    exitance_per_flux: Tbar^2, by which sums of R_d are what leaves of what arrives; edge: mm
+    reflectance: (L, V, V) mm^-2; variance: relative, of what the fill leaves open; open_area: (V,) mm^2 of the hats,
+    times the share of what leaves there that does not meet the object again; exitance_per_flux: Tbar^2, by which sums
+    of R_d are what leaves of what arrives; edge: mm; expected: (L, V) logarithms of the totals of a model of the whole
+    object, of any level, or None
     """
-    share = reflectance * area
+    share = reflectance * open_area
     total = share.sum(axis=2)
     open_deviation = (share * np.sqrt(variance)).sum(axis=2) / total  # errors of a column are alike: they simply add up
-    known = np.log(total * exitance_per_flux)
+    # Errors that neighbours share cannot be told from the object where nothing is known of its totals' shape.
+    shape, size = (np.zeros_like(total), 0.0) if expected is None else (expected, SHARED)
+    known = np.log(total * exitance_per_flux) - shape
+    shared = _spectrum(basis, SHARED_RANGE * edge, size)
 
     def field(laser: int, choice: tuple[float, float, float]) -> tuple[F64, F64, float]:
         length, deviation, common = choice
-        spectrum = 1.0 / basis.roughness(length * edge)
+        own = _spectrum(basis, length * edge, deviation)
         noise = open_deviation[laser] ** 2 + common**2
-        return Kriging(basis.functions, deviation**2 * spectrum / spectrum.sum(), noise).posterior(known[laser])
+        return Kriging(basis.functions, own, shared, noise).posterior(known[laser])
 
     choices = list(product(RANGES, DEVIATIONS, COMMON))
     middle = len(known) // 2  # one wavelength tells the lengths of all
     best = choices[int(np.argmax([field(middle, choice)[2] for choice in choices]))]
+    log.info("totals: correlated over %g edges, by %g; %g of a spot's own", *best)
     out = np.empty_like(reflectance)
     for laser, own in enumerate(reflectance):
         mean, spread, _ = field(laser, best)
-        wanted = np.exp(at_most_zero(mean, np.sqrt(spread))) / exitance_per_flux
-        factor = scaling(own, area, wanted)
+        wanted = np.exp(at_most_zero(mean + shape[laser], np.sqrt(spread))) / exitance_per_flux
+        factor = scaling(own, open_area, wanted)
         out[laser] = factor[:, None] * own * factor
     return out
+
+
+def _spectrum(basis: Harmonics, range_mm: float, deviation: float) -> F64:
+    """(n,) variances of a field's coefficients."""
+    spectrum = 1.0 / basis.roughness(range_mm)
+    return np.asarray(deviation**2 * spectrum / spectrum.sum())
 
 
 def at_most_zero(mean: F64, deviation: F64) -> F64:

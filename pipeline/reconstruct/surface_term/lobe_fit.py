@@ -22,7 +22,8 @@ from hw.base.arrays import F64, Bool
 from pipeline.calibrate.least_squares import Huber
 from pipeline.geometry.mesh import RayMesh
 from pipeline.reconstruct.global_term.boundary_fit import MATCHED
-from pipeline.reconstruct.global_term.radial_profile import LaserSamples, fit_profile
+from pipeline.reconstruct.global_term.radial_profile import fit_profile
+from pipeline.reconstruct.samples.laser_samples import LaserSamples
 from pipeline.reconstruct.samples.samples import Samples
 from pipeline.reconstruct.samples.surface_lobe import SurfaceLobe
 

@@ -22,6 +22,7 @@ from pipeline.reconstruct.global_term.completion import (
     measured_entries,
 )
 from pipeline.reconstruct.global_term.harmonics import harmonics
+from pipeline.reconstruct.global_term.prior import FAR, medium_priors
 from pipeline.reconstruct.methods import reconstruct
 from pipeline.reconstruct.omissions import colour_groups, is_opaque
 from pipeline.reconstruct.samples.samples import Samples
@@ -112,7 +113,7 @@ def test_measured_entries_hold_the_samples(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(completion, "steady_totals", lambda reflectance, *_: reflectance)  # a factor a vertex
     model = complete(s).terms[0]
     smooth = SymmetricField.of(harmonics(s.mesh, 500), s.lit, RANGE_EDGES * float(s.mesh.edges_unique_length.mean()))
-    fit = fit_laser(s, 0, smooth, np.zeros_like(smooth.penalty))
+    fit = fit_laser(s, 0, smooth, np.zeros_like(smooth.penalty), medium_priors(s)[1])
     expected = fit.at_spots * fit.tilt.factor(s.spot_pairs.distance, s.tilt)
     assert np.abs(fit.tilt(np.array([1.0, 3.0])) * 0.5).max() > 0.05  # the samples' tilt was seen
     observed = np.isfinite(s.values[0])
@@ -138,7 +139,7 @@ def test_noise_decides_between_sample_and_fill() -> None:
     """
     s, _, _ = spots_on_vertices(make(spots=80, noise=0.0, contrast=0.0), np.random.default_rng(8))
     smooth = SymmetricField.of(harmonics(s.mesh, 500), s.lit, 6.0)
-    fit = fit_laser(s, 0, smooth, np.zeros_like(smooth.penalty))
+    fit = fit_laser(s, 0, smooth, np.zeros_like(smooth.penalty), FAR)
     one, left = np.ones_like(fit.entries), np.full_like(fit.entries, 0.09)
     sure, nothing, measured = hold_measured(s, [fit], one, left)
     expected = fit.at_spots * fit.tilt.factor(s.spot_pairs.distance, s.tilt)
@@ -178,7 +179,7 @@ def test_the_boundary_is_compared_with_what_each_view_expects(monkeypatch: pytes
     views = [expected(SimpleNamespace(camera=SimpleNamespace(position=eye)))[0] for eye in eyes]
     lean = [sum(tilts(s.mesh, s.spots, eye, s.eta)) for eye in eyes]
     smooth = SymmetricField.of(harmonics(s.mesh, 500), s.lit, RANGE_EDGES * float(s.mesh.edges_unique_length.mean()))
-    tilt = fit_laser(s, 0, smooth, np.zeros_like(smooth.penalty)).tilt
+    tilt = fit_laser(s, 0, smooth, np.zeros_like(smooth.penalty), medium_priors(s)[1]).tilt
     factors = [tilt.factor(s.spot_pairs.distance, one) for one in lean]
     assert np.abs(factors[0] - factors[1]).max() > 0.1
     np.testing.assert_allclose(views[0] / views[1], factors[0] / factors[1], rtol=1e-5)
@@ -206,10 +207,10 @@ def test_a_spot_pulls_the_model_as_far_as_its_precision_says(small: Synthetic, f
     noisy = s.noise_per_signal.copy()
     noisy[:, spot] *= 1e5
     zero = np.zeros_like(field.penalty)
-    base = fit_laser(s, 0, field, zero).at_spots[spot]
+    base = fit_laser(s, 0, field, zero, FAR).at_spots[spot]
     far = (s.spot_pairs.distance[spot] > 5) & np.isfinite(s.values[0, spot])
-    sure = fit_laser(replace(s, values=raised), 0, field, zero).at_spots[spot]
-    unsure = fit_laser(replace(s, values=raised, noise_per_signal=noisy), 0, field, zero).at_spots[spot]
+    sure = fit_laser(replace(s, values=raised), 0, field, zero, FAR).at_spots[spot]
+    unsure = fit_laser(replace(s, values=raised, noise_per_signal=noisy), 0, field, zero, FAR).at_spots[spot]
     assert np.log(sure / base)[far].mean() > 0.15
     assert abs(np.log(unsure / base)[far].mean()) < 0.03
 

@@ -12,8 +12,10 @@ from pipeline.geometry.mesh import RayMesh
 from pipeline.model.tilt import TiltLaw
 from pipeline.reconstruct.baselines.dipole import dipole_reflectance, fit_dipole, fit_dipole_laser
 from pipeline.reconstruct.baselines.lambertian import fit_lambertian
-from pipeline.reconstruct.global_term.completion import complete, deviation
-from pipeline.reconstruct.global_term.radial_profile import TILT_EDGES, LaserSamples, fit_profile, scatter
+from pipeline.reconstruct.global_term.completion import complete
+from pipeline.reconstruct.global_term.prior import FAR, deviation
+from pipeline.reconstruct.global_term.radial_profile import TILT_EDGES, fit_profile
+from pipeline.reconstruct.samples.laser_samples import LaserSamples, scatter
 from pipeline.reconstruct.samples.spots import tilts
 
 
@@ -27,7 +29,8 @@ def test_profile_is_recovered() -> None:
 
 def test_deviation_and_scatter_grow_with_distance() -> None:
     d = np.linspace(0, 40, 50)
-    assert (np.diff(deviation(d)) >= 0).all()
+    assert (np.diff(deviation(d, FAR)) >= 0).all()
+    assert deviation(d, 0.3).max() == 0.3
     assert (np.diff(scatter(d)) > 0).all()
 
 

@@ -14,8 +14,8 @@ from hw.interface import Aim
 from hw.record import RawImage, Sensor
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.plan.plan import ImageAddress, Plan
-from pipeline.reconstruct.global_term.radial_profile import LaserSamples
 from pipeline.reconstruct.samples.image_operators import ImageOperator
+from pipeline.reconstruct.samples.laser_samples import LaserSamples
 from pipeline.reconstruct.samples.resample import Batch, BatchResult, Sums, ViewReader, _read
 from pipeline.reconstruct.samples.samples import ANGULAR, OBLIQUE, Samples, SpotSumImage, _Gathered
 from pipeline.reconstruct.samples.spots import Spots

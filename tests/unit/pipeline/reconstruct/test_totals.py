@@ -9,17 +9,26 @@ from scipy.stats import multivariate_normal, truncnorm
 
 from pipeline.geometry.mesh import RayMesh
 from pipeline.reconstruct.global_term.harmonics import harmonics
-from pipeline.reconstruct.global_term.totals import COMMON, Kriging, at_most_zero, scaling, steady_totals
+from pipeline.reconstruct.global_term.totals import (
+    COMMON,
+    SHARED,
+    SHARED_RANGE,
+    Kriging,
+    at_most_zero,
+    scaling,
+    steady_totals,
+)
 
 
 def test_kriging_agrees_with_the_dense_formulas() -> None:
     """Rationale: mean, variance and likelihood by the covariance matrix itself, in float64."""
     rng = np.random.default_rng(2)
     u, spectrum, noise = rng.standard_normal((40, 12)), rng.uniform(0.1, 1, 12), rng.uniform(0.1, 0.5, 40)
+    shared = rng.uniform(0.05, 0.5, 12)
     observed = 3.0 + u @ (np.sqrt(spectrum) * rng.standard_normal(12)) + np.sqrt(noise) * rng.standard_normal(40)
-    mean, variance, likelihood = Kriging(u, spectrum, noise).posterior(observed)
+    mean, variance, likelihood = Kriging(u, spectrum, shared, noise).posterior(observed)
     signal = (u * spectrum) @ u.T
-    whole, one = signal + np.diag(noise), np.ones(40)
+    whole, one = signal + (u * shared) @ u.T + np.diag(noise), np.ones(40)
     level = one @ np.linalg.solve(whole, observed) / (one @ np.linalg.solve(whole, one))
     np.testing.assert_allclose(mean, level + signal @ np.linalg.solve(whole, observed - level), rtol=1e-9)
     np.testing.assert_allclose(variance, np.diag(signal - signal @ np.linalg.solve(whole, signal)), rtol=1e-7)
@@ -78,3 +87,25 @@ def test_no_more_leaves_than_arrives(small: Synthetic) -> None:
     assert total.max() < 1.0
     assert total.mean() > 0.85
     assert np.std(total) < 0.5 * np.std((bad[0] @ area) * level)
+
+
+def test_totals_take_the_shape_that_is_expected_of_them(small: Synthetic) -> None:
+    """Rationale: the true matrix, its columns off by errors that neighbours share. Given the true totals' shape, most
+    of the error is told from the object and goes; without it, it is taken for the object.
+    """
+    mesh, true = small.samples.mesh, small.truth
+    area, edge = RayMesh.of(mesh).vertex_areas, small.samples.edge
+    basis, rng = harmonics(mesh, 500), np.random.default_rng(7)
+    totals = true[0] @ area
+    level = 0.5 / totals.mean()
+    spectrum = 1.0 / basis.roughness(SHARED_RANGE * edge)
+    amplitude = SHARED * np.sqrt(spectrum / spectrum.sum()) * rng.standard_normal(len(spectrum))
+    amplitude[0] = 0.0  # the level is nobody's
+    bad = true * np.exp(0.5 * (basis.functions @ amplitude))[:, None] * np.exp(0.5 * (basis.functions @ amplitude))
+    variance, left = np.full_like(true, 0.02**2), {}
+    for name, expected in (("given", np.log(totals)[None]), ("not", None)):
+        steady = steady_totals(bad, variance, area, level, basis, edge, expected)[0] @ area
+        left[name] = float(np.std(np.log(steady / totals)))
+    before = float(np.std(np.log((bad[0] @ area) / totals)))
+    assert left["given"] < before / 2
+    assert left["not"] > 0.8 * before
