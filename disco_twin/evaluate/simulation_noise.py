@@ -1,24 +1,39 @@
 """The simulation's noise beside the camera's: what a scene's walks buy, predicted and measured.
 
 A walk adds a splat of about the same radiance s to whichever pixel it reaches, so a pixel of mean radiance L has the
-variance s L / walks, from the peak down (docs/decisions/0053). The camera's own variance is known for every radiance.
+variance s L / walks, from the peak down (docs/decisions/0053); where split walks meet it as well, their density adds.
+The camera's own variance is known for every radiance. Decades are those of light below the brightest of a spot.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.camera.sensor import expected_variance
+from disco_twin.experiment.experiment import Experiment
 from disco_twin.light import MOST_CAMERAS
-from disco_twin.scene.scene import Scene
+from disco_twin.light.importance import Diffusion, diffusion
+from disco_twin.light.spot_walks import photon_density, walk_seconds
+from disco_twin.scene.scene import DEFAULT_WALKS, Scene
+from hw.base.arrays import F64
 from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.mesh import RayMesh
 
 RADIANCES = np.geomspace(1e-12, 1e-3, 400)  # W/(mm^2 sr), from below the camera's noise to its saturation
 FILES = 3  # of simulated spots that are looked at, evenly spread
+BOX = 5  # pixels along each side over which a pixel's variance and light are averaged
+DECADES = 7  # the last one holds all that is fainter
+SPOTS = 6  # for which a prediction is made
+CELLS = 24  # along the object, of the estimate
+PROBE_WALKS = 1 << 20  # a spot: noise is predicted for so many, and scaled
+MOST_WALKS = (1 << 32) - 1
 
 
 def splat(scene: Scene) -> float:
@@ -47,31 +62,131 @@ def walks_below_camera(scene: Scene) -> float:
     )
 
 
-def measured_noise(scene: Scene, responses: Path) -> dict[str, Any] | None:
-    """The simulated spots' variances beside the camera's, over pixels that a walk reached; None without any.
+@dataclass(frozen=True)
+class SpotCost:
+    """What a spot's light takes, as the scene states it. walks: as the time of so many plain ones; seconds: of a core;
+    median, by_decade: the simulation's predicted deviation over the camera's, within a factor of three.
+    """
 
-    median_over_camera: of the standard deviations' ratio; above_camera: share of pixels where it exceeds one;
-    walks_below_camera: walks a spot that would bring it below one in 99 of 100 of these pixels.
+    walks: int
+    seconds: float
+    median: float
+    by_decade: dict[str, float]
+
+
+def spot_cost(experiment: Experiment) -> SpotCost:
+    """The cost of a spot and the noise that is left, by the diffusion estimate.
+
+    Raises: InputError as `build_object`.
+    """
+    work = experiment.scene.simulation
+    estimate = diffusion(experiment.object, int(np.argmin(_absorption(experiment))), CELLS)
+    places = _lit_places(experiment)
+    each = walk_seconds(experiment.object, estimate.collisions(places))
+    median, by_decade = _predicted_noise(experiment, estimate, places)
+    if work.spot_seconds is not None:
+        walks = work.spot_seconds / each
+    elif work.spot_noise is not None:
+        walks = PROBE_WALKS * (median / work.spot_noise) ** 2
+    else:
+        walks = float(work.walks_per_spot or DEFAULT_WALKS)
+    count = int(min(max(round(walks), 1), MOST_WALKS))
+    scale = math.sqrt(PROBE_WALKS / count)
+    return SpotCost(count, count * each, scale * median, {d: scale * x for d, x in by_decade.items()})
+
+
+def _absorption(experiment: Experiment) -> list[float]:
+    medium = experiment.object.medium
+    return [float((s * (1 - a)).mean()) for s, a in zip(medium.sigma_t, medium.albedo, strict=True)]
+
+
+def _lit_places(experiment: Experiment) -> F64:
+    """(SPOTS, 3) vertices of the scan that face the projector, evenly spread over their list."""
+    scan = experiment.scan
+    towards = np.array(experiment.scene.rig.projector.position_mm) - scan.vertices
+    facing = np.flatnonzero((towards * scan.vertex_normals).sum(axis=1) > 0.3 * np.linalg.norm(towards, axis=1))
+    facing = facing if len(facing) else np.arange(len(scan.vertices))
+    return np.asarray(scan.vertices[facing[np.linspace(0, len(facing) - 1, SPOTS).round().astype(int)]])
+
+
+def _predicted_noise(experiment: Experiment, estimate: Diffusion, places: F64) -> tuple[float, dict[str, float]]:
+    """Deviation over the camera's with PROBE_WALKS: in the median of the pixels that show the object, and by decade."""
+    scene, scan = experiment.scene, experiment.scan
+    fluence = estimate.fluence(places)
+    at = estimate.unknowns(scan.vertices)
+    light = fluence[:, estimate.filled][:, at] * estimate.leak / np.pi
+    density = photon_density(estimate, fluence, PROBE_WALKS)[:, estimate.filled][:, at]
+    size, area = np.zeros(len(scan.vertices)), RayMesh.of(scan).vertex_areas
+    for camera in map(PinholeCamera.from_config, scene.rig.cameras):
+        towards = camera.position - scan.vertices
+        size += area * np.maximum((towards * scan.vertex_normals).sum(axis=1), 0) / np.linalg.norm(towards, axis=1) ** 3
+    sensor, s, ratios = lars3_sensor(scene.rig), splat(scene), []
+    for k, laser in enumerate(scene.rig.lasers):
+        watts = laser.power_mw * 1e-3
+        ratios.append(watts**2 * s * light / density / expected_variance(watts * light, sensor, k))
+    ratio = np.sqrt(np.stack(ratios))
+    decade = np.broadcast_to(_decade(light, light.max(axis=1, keepdims=True)), ratio.shape)
+    weight = np.broadcast_to(size, ratio.shape)
+    by_decade = {
+        str(-d): _median(ratio[decade == d], weight[decade == d]) for d in range(DECADES) if (decade == d).any()
+    }
+    return _median(ratio, weight), by_decade
+
+
+def _decade(light: F64, peak: F64) -> F64:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.clip(np.floor(-np.log10(light / peak)), 0, DECADES - 1))
+
+
+def _median(values: F64, weight: F64) -> float:
+    order = np.argsort(values, axis=None)
+    total = np.cumsum(weight.ravel()[order])
+    return float(values.ravel()[order][np.searchsorted(total, total[-1] / 2)])
+
+
+def measured_noise(scene: Scene, responses: Path) -> dict[str, Any] | None:
+    """The simulated spots' noise, from how their independent halves differ, beside the camera's; None without any.
+
+    Of all pixels that show the object (that light reached in any spot of a file): median_over_camera of the ratio of
+    the deviations, the shares where it is above one and above ten, and the share that no light reached, which counts as
+    above ten. A pixel's variance is the mean over BOX x BOX pixels. by_decade: of light below the spot's brightest, the
+    root mean square ratio and the share of pixels. Twice as good takes four times the walks.
     """
     files = sorted(responses.glob("spots-*.npy"))
     if not files:
         return None
-    sensor, ratios = lars3_sensor(scene.rig), []
+    sensor = lars3_sensor(scene.rig)
+    found: list[tuple[F64, F64, F64]] = []  # ratio, squared ratio without averaging, decade
     for index in np.unique(np.linspace(0, len(files) - 1, FILES).round().astype(int)):
-        path = files[index]
-        mean, variance = np.load(path, mmap_mode="r")
+        halves = np.load(files[index], mmap_mode="r").astype(np.float64)
+        mean, square = halves.mean(axis=0), (0.5 * (halves[0] - halves[1])) ** 2
+        shown = np.broadcast_to((mean > 0).any(axis=(0, 2))[None, :, None], mean.shape)
+        filled = np.maximum(_boxes(shown.astype(float)), 1e-12)
+        light, variance = (np.maximum(_boxes(images), 0.0) / filled for images in (mean, square))
+        decade = _decade(light, light.max(axis=(1, 2, 3, 4), keepdims=True))
         for k, laser in enumerate(scene.rig.lasers):
-            watts = laser.power_mw * 1e-3
-            lit = np.asarray(mean[:, :, k] > 0)
-            radiance = watts * np.asarray(mean[:, :, k], float)[lit]
-            ratios.append(watts**2 * np.asarray(variance[:, :, k], float)[lit] / expected_variance(radiance, sensor, k))
-    ratio = np.concatenate(ratios)
+            watts, part = laser.power_mw * 1e-3, shown[:, :, k]
+            camera = expected_variance(watts * light[:, :, k], sensor, k) / watts**2
+            ratio = np.where(mean[:, :, k] > 0, np.sqrt(variance[:, :, k] / camera), np.inf)
+            found += [(ratio[part], (square[:, :, k] / camera)[part], decade[:, :, k][part])]
+    ratio, squared, decade = (np.concatenate([f[n] for f in found]) for n in range(3))
     if not ratio.size:
         return None
-    walks = scene.simulation.walks_per_spot
+    median = float(np.median(ratio))
     return {
-        "walks_per_spot": walks,
-        "median_over_camera": float(np.sqrt(np.median(ratio))),
-        "above_camera": float((ratio > 1).mean()),
-        "walks_below_camera": float(walks * np.quantile(ratio, 0.99)),
+        "median_over_camera": median if math.isfinite(median) else None,
+        "above_camera_object": float((ratio > 1).mean()),
+        "above_ten_object": float((ratio > 10).mean()),
+        "unreached_object": float(np.isinf(ratio).mean()),
+        "by_decade": {
+            str(-d): {"over_camera": float(np.sqrt(squared[decade == d].mean())), "share": float((decade == d).mean())}
+            for d in range(DECADES)
+            if (decade == d).any()
+        },
     }
+
+
+def _boxes(images: F64) -> F64:
+    """Means over BOX x BOX pixels of the last two axes; nothing lies beyond an image's rim."""
+    kernel = (1,) * (images.ndim - 2) + (BOX, BOX)
+    return np.asarray(ndimage.uniform_filter(images, kernel, mode="constant"))

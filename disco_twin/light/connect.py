@@ -128,17 +128,12 @@ def project(cams: Cameras, camera: Any, point: Any) -> tuple[Any, Any, Any, Any,
     return position, towards, pixel, factor, inside
 
 
-def splat(
-    total: Any, squared: Any, images: Images, base: Any, stride: int, value: Any, lasers: int, rng: Rng, ok: Any
-) -> None:
-    """Add a contribution per wavelength, stochastically rounded to whole quanta."""
+def splat(total: Any, images: Images, pixel: Any, value: Any, lasers: int, rng: Rng, ok: Any) -> None:
+    """Add a contribution per wavelength to a pixel of all images, stochastically rounded to whole quanta."""
     dither = rng.next()
     for k in range(lasers):
-        v = dr.select(ok, value[k], 0.0)
-        count = mi.UInt64(v * images.inverse_quantum + dither)
-        square = mi.UInt64(v * v * images.inverse_quantum_squared + dither)
-        dr.scatter_add(total, count, base + k * stride, ok)
-        dr.scatter_add(squared, square, base + k * stride, ok)
+        count = mi.UInt64(dr.select(ok, value[k], 0.0) * images.inverse_quantum + dither)
+        dr.scatter_add(total, count, pixel * lasers + k, ok)
 
 
 @dr.syntax
@@ -175,16 +170,14 @@ def connect_lobes(
     turn = mi.UInt32(0)
     while dr.hint(turn < min(cams.count, MOST_CAMERAS), label="lobes"):
         camera, times = drawn_camera(cams, turn, rng)
-        base = (tag * (images.layers * cams.count) + camera) * (t.lasers * pixels)
+        base = (tag * (images.layers * cams.count) + camera) * pixels
         if dr.hint(t.matched, mode="scalar"):
             position, towards, pixel, factor, seen = project(cams, camera, point)
             if dr.hint(seen):
                 through, rng = straight_transmittance(t, point, position, rng)
                 phase = sampling.henyey_greenstein_pdf(dr.dot(before, towards), t.g)
-                splat(
-                    images.lobes, images.lobes_squared, images, base + pixel, pixels,
-                    weight * (phase * through * factor * times), t.lasers, rng, through > 0.0,
-                )  # fmt: skip
+                value = weight * (phase * through * factor * times)
+                splat(images.lobes, images, base + pixel, value, t.lasers, rng, through > 0.0)
         else:
             row = camera * ROW
             eye = mi.Point3f(*[dr.gather(mi.Float, cams.rows, row + k) for k in range(3)])
@@ -212,10 +205,7 @@ def connect_lobes(
                             value *= passed
                             start = mi.Point3f(hit.p + hit.n * t.lift)
                             blocked = t.scene.ray_test(mi.Ray3f(start, towards, FAR, 0.0, mi.Color0f()), False, True)
-                            splat(
-                                images.lobes, images.lobes_squared, images, base + pixel, pixels,
-                                weight * value, t.lasers, rng, ~blocked,
-                            )  # fmt: skip
+                            splat(images.lobes, images, base + pixel, weight * value, t.lasers, rng, ~blocked)
         turn += 1
     return rng
 
@@ -236,7 +226,7 @@ def connect_exit(
     while dr.hint(turn < min(cams.count, MOST_CAMERAS), label="exits"):
         camera, times = drawn_camera(cams, turn, rng)
         position, towards, pixel, factor, seen = project(cams, camera, si.p)
-        seen &= dr.dot(si.n, towards) > 0.0
+        seen &= (dr.dot(si.n, towards) > 0.0) & (dr.max(weight) > 0.0)
         if dr.hint(seen):
             value = t.bsdf.eval(context, si, si.to_local(towards), True)[0] * (factor * times)
             axis, kappa, usable = lobe_at(t, collision, position)
@@ -245,8 +235,8 @@ def connect_exit(
             if dr.hint(value > 0.0):
                 start = mi.Point3f(si.p + si.n * t.lift)
                 blocked = t.scene.ray_test(mi.Ray3f(start, towards, FAR, 0.0, mi.Color0f()), False, True)
-                base = (first_image(images, tag, surface_only, cams.count) + camera) * (t.lasers * pixels) + pixel
-                splat(images.exits, images.exits_squared, images, base, pixels, weight * value, t.lasers, rng, ~blocked)
+                base = (first_image(images, tag, surface_only, cams.count) + camera) * pixels
+                splat(images.exits, images, base + pixel, weight * value, t.lasers, rng, ~blocked)
         turn += 1
     return rng
 
@@ -270,6 +260,5 @@ def meet_sky(
 ) -> None:
     """What the sky radiates from the direction `towards` in which a walk from a pixel has left."""
     assert sky is not None and images is not None
-    base = first_image(images, tag, surface_only, 1) * t.lasers
     value = weight * sky.source.radiance(towards)
-    splat(images.exits, images.exits_squared, images, base, 1, value, t.lasers, rng, ok)
+    splat(images.exits, images, first_image(images, tag, surface_only, 1), value, t.lasers, rng, ok)

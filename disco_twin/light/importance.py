@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,11 +34,14 @@ STEEPEST = 32.0  # ratio of neighbouring cells' targets: where diffusion falls t
 class Splitting:
     """Where each tag's light enters, (T, 3) in mm, and how many times the collisions of an unsplit walk to spend.
 
-    What effort buys: docs/decisions/0050.
+    What effort buys: docs/decisions/0050. part: of images that plain and split walks make together (`splitting.counted`)
+    whose these are, with `plain` of the former to each of the latter; their sum is the whole.
     """
 
     entries: F64
     effort: float = 3.0
+    part: Literal["plain", "split"] | None = None
+    plain: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,8 @@ class Diffusion:
     """The equation, factorised, for one wavelength.
 
     filled: (n, n, n) whether the cell's middle lies in the object; number: (n, n, n) its unknown, the nearest one's
-    outside; both indexed [z, y, x]; low: corner in mm; cell: edge in mm; factor: solves for the fluence of 1 W, 1/mm^2.
+    outside; both indexed [z, y, x]; low: corner in mm; cell: edge in mm; factor: solves for the fluence of 1 W, 1/mm^2;
+    sigma_t: (unknowns,) 1/mm; leak: power that leaves per area of the surface and fluence.
     """
 
     filled: Bool
@@ -64,6 +68,8 @@ class Diffusion:
     low: F64
     cell: float
     factor: Any
+    sigma_t: F64
+    leak: float
 
     def unknowns(self, points: ArrayLike) -> I64:
         """(N,) numbers of the cells that `points` (N, 3) lie in, clamped to the object."""
@@ -77,6 +83,10 @@ class Diffusion:
         right = np.zeros((self.factor.shape[0], len(cells)))
         right[cells, np.arange(len(cells))] = 1.0
         return np.ascontiguousarray(np.moveaxis(self.factor.solve(right)[self.number], -1, 0))
+
+    def collisions(self, points: ArrayLike) -> float:
+        """How often a photon that enters at one of `points` (N, 3) is scattered before it leaves, in the mean."""
+        return float(self.spread(points) @ self.sigma_t) * self.cell**3
 
     def spread(self, points: ArrayLike) -> F64:
         """(cells,) fluence of 1 W shared among the `points` (N, 3)."""
@@ -143,7 +153,8 @@ def diffusion(obj: TwinObject, laser: int, cells: int = CELLS) -> Diffusion:
     options = {"SymmetricMode": True}
     factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
     nearest = ndimage.distance_transform_edt(~filled, return_indices=True, return_distances=False)
-    return Diffusion(filled, number[tuple(nearest)], corner, cell, factor)
+    sigma_t = absorption + scattering / (1 - obj.medium.g[laser])
+    return Diffusion(filled, number[tuple(nearest)], corner, cell, factor, sigma_t, float(leak))
 
 
 def view_targets(estimate: Diffusion, views: Views) -> F64:

@@ -1,7 +1,8 @@
 """The object's response to laser spots, as the twin's cameras will see it: simulated ahead, kept on disk, reused.
 
 A spot's images depend on (seed, spot) alone, not on what it was simulated together with, so an interrupted capture
-continues with the very same light.
+continues with the very same light. They are made by plain and by split walks together, each counted where its photons
+are dense (docs/decisions/0130), in two halves with random numbers of their own: how they differ is what the noise is.
 """
 
 from __future__ import annotations
@@ -17,10 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from disco_twin.faults.actual_rig import ActualRig
+from disco_twin.light.importance import Splitting
 from disco_twin.light.sources import BeamSource, Source
+from disco_twin.light.splitting import Part
+from disco_twin.light.spot_walks import EFFORT, HALVES, part_walks
 from disco_twin.light.transport import Transport
 from disco_twin.object.build import TwinObject
-from hw.base.arrays import F32
+from hw.base.arrays import F32, F64
 from hw.base.errors import refused_by_the_disk
 from hw.base.files import replacing
 from hw.interface import Aim
@@ -53,9 +57,9 @@ def light_key(obj: TwinObject, config: RigConfig, actual: ActualRig) -> str:
 class SpotResponses:
     """Implements `disco_twin.emulation.twin_rig.ResponseSource` by the photon walk.
 
-    Each chunk of spots is one file `spots-<name>.npy` in `scratch`, (2, spots, C, L, H, W) float32: mean radiance per
-    watt, and the simulation's own variance of it. `code` is the key of the code that simulates: what other code left
-    is not read.
+    Each chunk of spots is one file `spots-<name>.npy` in `scratch`, (HALVES, spots, C, L, H, W) float32 radiance per
+    watt, whose mean is the image. walks: what a spot may cost, as the time of so many plain walks. `code` is the key of
+    the code that simulates: what other code left is not read.
     """
 
     def __init__(
@@ -82,11 +86,7 @@ class SpotResponses:
 
     def image(self, camera: int, aim: Aim, laser: int) -> F32:
         """(H, W) radiance per watt in W/(mm^2 sr)."""
-        return self._spot(aim)[0, camera, laser]
-
-    def variance(self, camera: int, aim: Aim, laser: int) -> F32:
-        """(H, W) variance of `image` by the simulation's own noise."""
-        return self._spot(aim)[1, camera, laser]
+        return np.asarray(self._spot(aim)[:, camera, laser].mean(axis=0))
 
     def _spot(self, aim: Aim) -> F32:
         if aim not in self._chunk_of:
@@ -109,22 +109,43 @@ class SpotResponses:
         return np.asarray(np.load(path, mmap_mode="r"))
 
     def _simulate(self, chunk: tuple[Aim, ...]) -> F32:
-        origins, directions = self.actual.spot_rays(chunk)
-        beam = self.config.projector
-        names = np.array([zlib.crc32(repr(aim).encode()) for aim in chunk], np.uint32)
+        origins, directions = (np.tile(rays, (HALVES, 1)) for rays in self.actual.spot_rays(chunk))
+        beam, tags = self.config.projector, HALVES * len(chunk)
+        entries = places_of_entry(self.transport, origins, directions)
+        plain, split = part_walks(self.walks)
 
         def source(group: Sequence[int]) -> Source:
-            power = np.ones((len(chunk), len(group)))
-            return BeamSource(origins, directions, beam.beam_diameter_mm / 2, power, beam.beam_profile)
+            return BeamSource(
+                origins, directions, beam.beam_diameter_mm / 2, np.ones((tags, len(group))), beam.beam_profile
+            )
 
-        cameras = self.views[chunk[0].angle]
-        traced = self.transport.trace(source, len(chunk), self.walks, seed=self.seed, streams=names, cameras=cameras)
-        assert traced.images is not None and traced.variance is not None
-        return np.stack([traced.images[:, 0], traced.variance[:, 0]])
+        def images(part: Part, walks: int) -> F32:
+            names = [zlib.crc32(repr((aim, half, part)).encode()) for half in range(HALVES) for aim in chunk]
+            traced = self.transport.trace(
+                source, tags, walks, seed=self.seed, streams=np.array(names, np.uint32),
+                cameras=self.views[chunk[0].angle], split=Splitting(entries, EFFORT, part, plain / split),
+            )  # fmt: skip
+            assert traced.images is not None
+            return traced.images[:, 0]
+
+        total = images("plain", plain) + images("split", split)
+        return total.reshape(HALVES, len(chunk), *total.shape[1:])
 
     def silhouette(self, camera: int, angle: int) -> F32:
         """(H, W) radiance of the object, dusted white, under floodlights around the camera; the background is dark."""
         return floodlit(self.transport.scene, self.views[angle][camera])
+
+
+def places_of_entry(transport: Transport, origins: F64, directions: F64) -> F64:
+    """(N, 3) where the axes of beams (N, 3) meet the object, mm; of those that miss it, the vertex that is nearest."""
+    ray = mi.Ray3f(mi.Point3f(origins.T.astype(np.float32)), mi.Vector3f(directions.T.astype(np.float32)))
+    hit = transport.scene.ray_intersect(ray, mi.RayFlags.Minimal, True, True)
+    places = np.array(hit.p).T.astype(float)
+    for k in np.flatnonzero(~np.array(hit.is_valid())):
+        offset = transport.vertices - origins[k]
+        beside = offset - (offset @ directions[k])[:, None] * directions[k]
+        places[k] = transport.vertices[np.argmin((beside**2).sum(axis=1))]
+    return places
 
 
 def floodlit(scene: mi.Scene, camera: PinholeCamera, supersample: int = 4) -> F32:

@@ -9,7 +9,7 @@ The expected power of every state is conserved whatever the targets: they decide
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -21,11 +21,14 @@ CAPACITY = 24  # states that wait; a photon that finds the stack full is not spl
 MOST_COPIES = 8  # of one split
 PLAIN_TARGET = 0.2  # of a launched photon's power, without a window: roulette alone
 
+Part = Literal["plain", "split"]
+
 
 class Window(Opaque):
     """Target weights, as shares of a launched photon's usual power, on maps of cells around the object.
 
-    target: Float, per map `cells`^3 values; maps: UInt32 per tag, the number of its map.
+    target: Float, per map `cells`^3 values; maps: UInt32 per tag, the number of its map. part: of images that plain and
+    split walks make together, whose this walk is (`counted`), plain: how many of those there are to each split one.
     """
 
     target: Any
@@ -33,6 +36,13 @@ class Window(Opaque):
     cells: int
     low: Any
     inverse_cell: Any
+    part: Part | None
+    plain: Any
+
+    @property
+    def splits(self) -> bool:
+        """Whether photons are split."""
+        return self.part != "plain"
 
 
 def target_at(window: Window, tag: Any, p: Any) -> Any:
@@ -42,6 +52,19 @@ def target_at(window: Window, tag: Any, p: Any) -> Any:
     number = dr.gather(mi.UInt32, window.maps, tag)
     index = mi.UInt32((cell.z * window.cells + cell.y) * window.cells + cell.x)
     return dr.gather(mi.Float, window.target, number * (window.cells**3) + index)
+
+
+def counted(window: Window | None, tag: Any, p: Any) -> Any:
+    """Share of what connects from p to the cameras that this walk counts; 1 unless it makes its images with another.
+
+    The balance heuristic (Veach 1997, section 9.2.2) by the expected density of photons: of each split walk 1 / target
+    to one of a plain walk. It depends on the place alone, and the shares of both parts add up to one, so the sum of
+    their images is unbiased whatever the targets.
+    """
+    if window is None or window.part is None:
+        return mi.Float(1.0)
+    of_plain = window.plain * target_at(window, tag, p)
+    return (of_plain if window.part == "plain" else 1.0) / (of_plain + 1.0)
 
 
 @dataclass
@@ -97,7 +120,7 @@ def weigh(
     """
     if dr.hint(photon.alive & photon.inside & (dr.squared_norm(photon.clear) == 0.0)):
         target = mi.Float(PLAIN_TARGET)
-        if dr.hint(window is not None, mode="scalar"):
+        if dr.hint(stack is not None, mode="scalar"):
             target = target_at(window, first_tag + photon.tag, photon.p)
         ratio = dr.max(photon.w) * inverse_scale / target
         if dr.hint(ratio < 0.5):
@@ -106,7 +129,7 @@ def weigh(
             sums.roulette += type(sums.roulette)(after - photon.w)
             photon.w = after
             photon.alive = mi.Bool(survives)
-        if dr.hint(window is not None, mode="scalar"):
+        if dr.hint(stack is not None, mode="scalar"):
             if dr.hint((ratio >= 2.0) & (stack.depth < CAPACITY)):
                 count = mi.UInt32(dr.minimum(ratio, MOST_COPIES))
                 photon.w /= mi.Float(count)

@@ -76,19 +76,16 @@ class Sky(Opaque):
 
 
 class Images(Opaque):
-    """Integer accumulators of the images: sums and sums of squares from exits and from lobe connections.
+    """Integer accumulators of the images: sums from exits and from lobe connections.
 
-    Index ((tag * layers + layer) * cameras + camera) * lasers + laser) * pixels + pixel; layers are 1 (all light) or 2
-    (light from below the surface, light reflected at it). One count is `quantum` (`quantum_squared`).
+    Index (((tag * layers + layer) * cameras + camera) * pixels + pixel) * lasers + laser; layers are 1 (all light) or 2
+    (light from below the surface, light reflected at it). One count is `quantum`.
     """
 
     layers: int
     exits: Any
-    exits_squared: Any
     lobes: Any
-    lobes_squared: Any
     inverse_quantum: Any
-    inverse_quantum_squared: Any
 
 
 class Deposits(Opaque):

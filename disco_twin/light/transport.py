@@ -49,12 +49,11 @@ class CameraLobe:
 class Traced:
     """What a trace measured, per watt of the source's own power scale.
 
-    images, variance: (T, layers, C, L, H, W) float32 radiance [1/(mm^2 sr) per W launched] and the variance of its mean
+    images: (T, layers, C, L, H, W) float32 radiance [1/(mm^2 sr) per W launched]
     deposits: (T, L, V) float64 power that left at each vertex's hat function; either is None if not asked for
     """
 
     images: F32 | None
-    variance: F32 | None
     deposits: F64 | None
     balance: EnergyBalance
 
@@ -85,6 +84,7 @@ class Transport:
         self.scene = mesh_scene(self.vertices, self.faces, bsdfs[obj.boundary.kind])
         self._cells, self._local = cells, local
         self._diffusion: dict[int, Diffusion] = {}
+        self._last_targets: tuple[tuple[int, bytes, float], F64] | None = None
         self._kept: dict[tuple[int, ...], kernel.Tables] = {}
 
     @cached_property
@@ -188,14 +188,24 @@ class Transport:
             targets, maps = view_targets(estimate, split), np.zeros(tags, np.int64)
         else:
             places, maps = np.unique(split.entries, axis=0, return_inverse=True)
-            targets = window_targets(estimate.fluence(places), estimate.filled, split.effort)
+            targets = self._targets(laser, places, split.effort)
         return Window(
             target=to_float(targets),
             maps=mi.UInt32(maps.ravel().astype(np.uint32)),
             cells=len(estimate.number),
+            part=split.part if isinstance(split, Splitting) else None,
+            plain=dr.opaque(mi.Float, split.plain if isinstance(split, Splitting) else 1.0),
             low=opaque3(mi.Point3f, estimate.low),
             inverse_cell=dr.opaque(mi.Float, 1 / estimate.cell),
         )
+
+    def _targets(self, laser: int, places: F64, effort: float) -> F64:
+        """`window_targets` of light that enters at `places`; the last ones are kept, for two walks that share them."""
+        key = laser, places.tobytes(), effort
+        if self._last_targets is None or self._last_targets[0] != key:
+            estimate = self._diffusion[laser]
+            self._last_targets = key, window_targets(estimate.fluence(places), estimate.filled, effort)
+        return self._last_targets[1]
 
     def trace(
         self,
@@ -242,7 +252,7 @@ class Transport:
         names = EnergyBalance.__dataclass_fields__
         balance = EnergyBalance(**{k: np.concatenate([getattr(p.balance, k) for p in parts])[order] for k in names})
         balance.warn_of_loss()
-        return Traced(join("images", 3), join("variance", 3), join("deposits", 1), balance)
+        return Traced(join("images", 3), join("deposits", 1), balance)
 
     def _trace_group(
         self, source: Source, group: tuple[int, ...], tags: int, walks: int, seed: int, streams: NDArray[np.uint32],
@@ -253,13 +263,13 @@ class Transport:
         table = camera_table(cameras) if cameras else None
         met = kernel.Sky(source=sky) if sky is not None else None
         layout = (table.count, len(group), table.height, table.width) if table else (1, len(group), 1, 1) if met else ()
-        numbers = 4 * layers * (int(np.prod(layout)) // len(group)) if layout else 0
+        numbers = 2 * layers * (int(np.prod(layout)) // len(group)) if layout else 0
         per_tag = 8 * len(group) * (numbers + deposit * len(self.vertices))
         batch = max(1, min(tags, ACCUMULATOR_BYTES // max(per_tag, 1), (1 << 31) // max(walks, 1)))
         names = mi.UInt32(streams)
         window = self._window(group, split, tags) if split is not None else None
         total = {name: np.zeros(len(group)) for name in Tally.__dataclass_fields__}
-        images, variances, deposits = [], [], []
+        images, deposits = [], []
         for low in range(0, tags, batch):
             n = min(batch, tags - low)
             shape = (n, layers, *layout)
@@ -279,16 +289,13 @@ class Transport:
                     value = np.array(getattr(balance, name), np.float64).reshape(len(group), -1)
                     total[name] += value.sum(axis=1)
             if pictures is not None:
-                mean, variance = read_images(pictures, shape, walks)
-                images.append(mean)
-                variances.append(variance)
+                images.append(read_images(pictures, shape, walks))
             if powers is not None:
                 counts = np.array(powers.total, np.float64).reshape(n, len(group), -1)
                 deposits.append(counts * (powers.scale / walks))
         scale = 1.0 / (tags * walks)
         return Traced(
             np.concatenate(images) if images else None,
-            np.concatenate(variances) if variances else None,
             np.concatenate(deposits) if deposits else None,
             EnergyBalance(**{name: value * scale for name, value in total.items()}),
         )
@@ -336,26 +343,23 @@ def nearest_factor(cameras: Sequence[PinholeCamera]) -> float:
 def new_images(layers: int, size: int, unit: float) -> kernel.Images:
     """Zeroed accumulators. The quantum is 2^-24 of `unit`, what a photon of usual power adds."""
     quantum = 2.0 ** (np.floor(np.log2(unit)) - 24)
-    quantum_squared = 2.0 ** (2 * np.floor(np.log2(unit)) - 24)
-    arrays = [dr.zeros(mi.UInt64, size) for _ in range(4)]
+    arrays = [dr.zeros(mi.UInt64, size) for _ in range(2)]
     dr.eval(arrays)
     return kernel.Images(
         layers=layers,
-        **dict(zip(("exits", "exits_squared", "lobes", "lobes_squared"), arrays, strict=True)),
+        exits=arrays[0],
+        lobes=arrays[1],
         inverse_quantum=dr.opaque(mi.Float, 1 / quantum),
-        inverse_quantum_squared=dr.opaque(mi.Float, 1 / quantum_squared),
     )
 
 
-def read_images(images: kernel.Images, shape: tuple[int, ...], walks: int) -> tuple[F32, F32]:
-    """Mean and variance of the mean per pixel; splats of one photon into one pixel are taken as independent."""
+def read_images(images: kernel.Images, shape: tuple[int, ...], walks: int) -> F32:
+    """Mean per pixel, of `shape` (..., L, H, W)."""
     quantum = 1 / float(images.inverse_quantum[0])
-    quantum_squared = 1 / float(images.inverse_quantum_squared[0])
-    size = int(np.prod(shape))
-    mean = (np.array(images.exits) + np.array(images.lobes)).astype(np.float64) * (quantum / walks)
-    square = (np.array(images.exits_squared) + np.array(images.lobes_squared)).astype(np.float64)
-    variance = np.maximum(square * (quantum_squared / walks) - mean**2, 0.0) / walks
-    return mean[:size].reshape(shape).astype(np.float32), variance[:size].reshape(shape).astype(np.float32)
+    mean = (np.array(images.exits) + np.array(images.lobes))[: int(np.prod(shape))].astype(np.float64)
+    *front, lasers, height, width = shape
+    mean = np.moveaxis((mean * (quantum / walks)).reshape(*front, height, width, lasers), -1, -3)
+    return np.ascontiguousarray(mean, np.float32)
 
 
 def new_deposits(size: int, walks: int) -> kernel.Deposits:

@@ -34,7 +34,7 @@ from disco_twin.light import sampling
 from disco_twin.light.connect import CONNECTIONS, connect_exit, connect_lobes, meet_sky, promise
 from disco_twin.light.sampling import Rng
 from disco_twin.light.sources import Source, weight_type
-from disco_twin.light.splitting import Window, new_stack, resume, weigh
+from disco_twin.light.splitting import Window, counted, new_stack, resume, weigh
 from disco_twin.light.tables import (
     FAR,
     Cameras,
@@ -129,7 +129,10 @@ def no_photons(weight: Any, lanes: int) -> tuple[Photon, Reservoir]:
 
 
 @dr.syntax
-def collide(t: Tables, photon: Photon, rate: Any, reservoir: Reservoir, sums: Tally, rng: Rng, connects: bool) -> Any:
+def collide(
+    t: Tables, photon: Photon, rate: Any, reservoir: Reservoir, sums: Tally, rng: Rng, connects: bool,
+    window: Window | None, first_tag: Any,
+) -> Any:  # fmt: skip
     """A possible collision at the photon's place, after a flight under the majorant `rate`: absorb, offer it to the
     reservoir, scatter; or nothing (null).
 
@@ -142,8 +145,9 @@ def collide(t: Tables, photon: Photon, rate: Any, reservoir: Reservoir, sums: Ta
         near = near_surface(t, photon.empty)
         if dr.hint(connects, mode="scalar"):
             share = promise(t, photon.empty)
-            reservoir.seen = dr.select(near, reservoir.seen + share, reservoir.seen)
-            take = near & (rng.next() * reservoir.seen < share)
+            chance = share * counted(window, first_tag + photon.tag, photon.p)
+            reservoir.seen = dr.select(near, reservoir.seen + chance, reservoir.seen)
+            take = near & (rng.next() * reservoir.seen < chance)
             reservoir.point = dr.select(take, photon.p, reservoir.point)
             reservoir.before = dr.select(take, photon.d, reservoir.before)
             reservoir.weight = dr.select(take, photon.w / share, reservoir.weight)
@@ -161,7 +165,7 @@ def collide(t: Tables, photon: Photon, rate: Any, reservoir: Reservoir, sums: Ta
 @dr.syntax
 def cross(
     t: Tables, photon: Photon, si: Any, cams: Cameras | None, images: Images | None, deposits: Deposits | None,
-    sums: Tally, rng: Rng,
+    sums: Tally, rng: Rng, window: Window | None, first_tag: Any,
 ) -> Any:  # fmt: skip
     """The photon meets the surface at si: connects to the cameras, is reflected or refracted, or leaves.
 
@@ -177,8 +181,9 @@ def cross(
         si.wi = si.to_local(-photon.d)
         if dr.hint(cams is not None, mode="scalar"):
             lobed = photon.inside & photon.in_reach & (dr.norm(si.p - photon.last) < t.length)
+            weight = photon.w * counted(window, first_tag + photon.tag, dr.select(lobed, photon.last, si.p))
             rng = connect_exit(
-                t, cams, images, photon.tag, si, photon.d, photon.w, photon.last, photon.phase, lobed, ~photon.entered,
+                t, cams, images, photon.tag, si, photon.d, weight, photon.last, photon.phase, lobed, ~photon.entered,
                 rng,
             )  # fmt: skip
         sample, value = t.bsdf.sample(boundary_context(t), si, rng.next(), rng.next2(), True)
@@ -203,7 +208,8 @@ def cross(
 @dr.syntax
 def fly(
     t: Tables, photon: Photon, flight: Any, rate: Any, reservoir: Reservoir, cams: Cameras | None,
-    sky: Sky | None, images: Images | None, deposits: Deposits | None, sums: Tally, rng: Rng,
+    sky: Sky | None, images: Images | None, deposits: Deposits | None, sums: Tally, rng: Rng, window: Window | None,
+    first_tag: Any,
 ) -> Any:  # fmt: skip
     """A flight that may meet the surface: up to it, to the collision at its end, or out of sight.
 
@@ -217,7 +223,7 @@ def fly(
     photon.clear = mi.Vector3f(0.0)
     # Measured from p itself: the lifted origin is nearer to the far wall, which matters in thin plates.
     if dr.hint(si.is_valid() & (~photon.inside | (dr.dot(si.p - photon.p, photon.d) < flight))):
-        photon, sums, rng = cross(t, photon, si, cams, images, deposits, sums, rng)
+        photon, sums, rng = cross(t, photon, si, cams, images, deposits, sums, rng, window, first_tag)
     else:
         if dr.hint(photon.inside):
             photon.p = mi.Point3f(dr.fma(photon.d, flight, photon.p))
@@ -226,7 +232,9 @@ def fly(
             sums.inside += wide(dr.select(leaked, photon.w, 0.0))
             photon.alive = ~leaked
             if dr.hint(~leaked):
-                photon, reservoir, sums, rng = collide(t, photon, rate, reservoir, sums, rng, cams is not None)
+                photon, reservoir, sums, rng = collide(
+                    t, photon, rate, reservoir, sums, rng, cams is not None, window, first_tag
+                )
         else:
             if dr.hint(sky is not None, mode="scalar"):
                 # Not of a walk that has met nothing: what lies behind the object is no part of its image.
@@ -262,11 +270,11 @@ def walk(
     photon, reservoir = no_photons(weight, lanes)
     flight, rate = dr.zeros(mi.Float, lanes), dr.ones(mi.Float, lanes)
     running = dr.full(mi.Bool, True, lanes)
-    stack = new_stack(t, cams is not None, lanes) if window is not None else None
+    stack = new_stack(t, cams is not None, lanes) if window is not None and window.splits else None
 
     while dr.hint(running, label="walk"):
         # 1. A lane without a photon takes a copy that waits, or fetches the next one.
-        if dr.hint(window is not None, mode="scalar"):
+        if dr.hint(stack is not None, mode="scalar"):
             photon, stack = resume(t, stack, photon, running, weight, cams is not None)
         need = running & ~photon.alive
         if dr.hint(need):
@@ -294,12 +302,14 @@ def walk(
                 # Copies: two names of one object would be merged as one when Dr.Jit joins the branches.
                 photon.p, photon.empty, photon.rate = mi.Point3f(q), mi.Float(ball), mi.Float(there)
                 photon.clear = mi.Vector3f(0.0)
-                photon, reservoir, sums, rng = collide(t, photon, rate, reservoir, sums, rng, cams is not None)
+                photon, reservoir, sums, rng = collide(
+                    t, photon, rate, reservoir, sums, rng, cams is not None, window, first_tag
+                )
 
         # 3. The surface, or a collision that the distance field could not vouch for.
         if dr.hint(photon.alive & pending):
             photon, reservoir, sums, rng = fly(
-                t, photon, flight, rate, reservoir, cams, sky, images, deposits, sums, rng
+                t, photon, flight, rate, reservoir, cams, sky, images, deposits, sums, rng, window, first_tag
             )
 
         # 4. One drawn collision connects to the cameras, also of a photon that has just left.

@@ -2,39 +2,40 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
 
-from disco_twin.evaluate.simulation_noise import walks_below_camera
+from disco_twin.evaluate.simulation_noise import SpotCost, spot_cost, walks_below_camera
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.omissions import left_out_by_the_twin
 from disco_twin.experiment.references import holds_reference
 from hw.base.resources import usable_cores
 from pipeline.plan.targets import make_targets
 
-# Walks per core and second of quick.toml's stages as a run times them, compilation and the images' exposure included
-# (docs/decisions/0052). Other media scale with the number of collisions: there a guess within a factor of two or three.
-SPOT_WALKS, TRUTH_WALKS = 85_000.0, 110_000.0
-REFERENCE_SECONDS = 80.0  # core-seconds of a light, in both of quick's views at 3 % noise (docs/decisions/0054)
+# Core-seconds of stages as runs of quick.toml time them, compilation included (docs/decisions/0052), beside those of so
+# many plain walks. Other media scale with the number of collisions: there a guess within a factor of two or three.
+TRUTH_COST = 0.9  # of a column's walk, with windows and without cameras
+EXPOSURE_S = 0.004  # of a spot's image: window, exposure, codec
+REFERENCE_WALKS = 8e6  # of a light, in both of quick's views at 3 % noise (docs/decisions/0054)
 COMPRESSION = 7.0  # docs/decisions/0002
 IMAGES_PER_S = 15.0  # of the real rig (thesis 4.1)
 BYTES_PER_PIXEL = 3
 
 
-def simulation_seconds(experiment: Experiment, lights: int, cores: int) -> dict[str, float]:
+def simulation_seconds(experiment: Experiment, spot: SpotCost, lights: int, cores: int) -> dict[str, float]:
     """Seconds of each stage that walks photons, by the wall clock. lights: how many have references to be rendered.
 
     Wavelengths that share sigma_t and g share their walks.
     """
-    work, medium = experiment.scene.simulation, experiment.object.medium
+    work, plan = experiment.scene.simulation, experiment.plan
     images = sum(view.width * view.height for view in experiment.scene.relight.views) / (2 * 192 * 124)  # of quick's
-    groups = len({(m.tobytes(), g) for m, g in zip(medium.sigma_t, medium.g, strict=True)})
+    walk = spot.seconds / spot.walks
+    exposures = len(plan) * EXPOSURE_S
     return {
-        "capture": len(experiment.plan.spots) * work.walks_per_spot * groups / SPOT_WALKS / cores,
-        "truth": work.truth_columns * work.truth_walks * groups / TRUTH_WALKS / cores,
-        "references": lights * REFERENCE_SECONDS * groups * images * (0.03 / work.reference_noise) ** 2 / cores,
+        "capture": (len(plan.spots) * spot.seconds + exposures) / cores,
+        "truth": work.truth_columns * work.truth_walks * TRUTH_COST * walk / cores,
+        "references": lights * REFERENCE_WALKS * walk * images * (0.03 / work.reference_noise) ** 2 / cores,
     }
 
 
@@ -46,10 +47,10 @@ def predict(experiment: Experiment, shipped: Path) -> list[tuple[str, str]]:
     raw = images * pixels * BYTES_PER_PIXEL
     responses = len(plan.spots) * plan.lasers * len(scene.rig.cameras) * pixels
     scratch = responses * 2 * np.dtype(np.float32).itemsize  # image and variance
-    work = scene.simulation
     cores, views = usable_cores(), scene.relight.views
     lights = sum(not all(holds_reference(shipped, experiment, x, v) for v in views) for x in scene.relight.lights)
-    seconds = simulation_seconds(experiment, lights, cores)
+    spot = spot_cost(experiment)
+    seconds = simulation_seconds(experiment, spot, lights, cores)
     triangles, vertices = len(experiment.object.mesh.faces), len(experiment.scan.vertices)
     lines = [
         ("scene", f"{scene.name}: {triangles} triangles, scan of {vertices} vertices"),
@@ -71,10 +72,12 @@ def predict(experiment: Experiment, shipped: Path) -> list[tuple[str, str]]:
     lines.append(
         (
             "noise",
-            f"of the simulation up to {math.sqrt(needed / work.walks_per_spot):.0f} times the camera's in a pixel with "
-            f"{work.walks_per_spot} walks a spot; {needed:.1e} bring it below the camera's in every pixel (within a "
-            "factor of three); the spots' variance is kept pixel by pixel",
+            f"of the simulation {spot.median:.3g} times the camera's in the median pixel, in the time of {spot.walks} "
+            f"plain walks a spot ({spot.seconds:.2g} s of a core); half of it takes four times as long, {needed:.1e} "
+            "plain walks bring it below the camera's in every pixel (all within a factor of three)",
         )
     )
+    by_decade = ", ".join(f"{decade}: {ratio:.3g}" for decade, ratio in spot.by_decade.items())
+    lines.append(("", f"by decade below a spot's peak {by_decade}"))
     lines += [("left out", f"{item['what']}: {item['because']}") for item in left_out_by_the_twin(experiment)]
     return lines

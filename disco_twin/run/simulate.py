@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from disco_twin.emulation.twin_rig import TwinRig
+from disco_twin.evaluate.simulation_noise import spot_cost
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.keys import code_key
 from disco_twin.faults.actual_rig import actual_rig
@@ -19,7 +20,7 @@ def twin_rig(experiment: Experiment, responses: Path) -> TwinRig:
     from disco_twin.light.response import SpotResponses
 
     scene = experiment.scene
-    actual, walks = actual_rig(scene.rig, scene.seed), scene.simulation.walks_per_spot
+    actual, walks = actual_rig(scene.rig, scene.seed), spot_cost(experiment).walks
     seed, code = experiment.seed("spots"), code_key(SPOT_CODE)
     light = SpotResponses(transport, scene.rig, actual, walks, seed, responses, code)
     return TwinRig(scene.rig, light, scene.seed, actual)

@@ -17,17 +17,32 @@ from pipeline.relight.lights import Colour, Light, shipped_lights
 
 Count = Annotated[int, Field(ge=1, lt=2**32)]  # photons are numbered in 32 bits
 Profile = Literal["full", "small"]
+DEFAULT_WALKS = 200_000
+SPOT_BUDGETS = ("walks_per_spot", "spot_seconds", "spot_noise")
 
 
 class SimulationConfig(Strict):
     """How much light is traced; the noise goes with the inverse square root of the walks, their time with its inverse
     square.
+
+    What a spot may cost is stated as a time or as a noise, one of three keys: the time of so many plain walks
+    (`walks_per_spot`; `DEFAULT_WALKS` where no key is stated), seconds of one core, as `disco-twin plan` predicts them
+    (`spot_seconds`), or the simulation's deviation over the camera's in the median pixel (`spot_noise`).
     """
 
-    walks_per_spot: Count = 200_000
+    walks_per_spot: Count | None = None
+    spot_seconds: Annotated[float, Field(ge=1e-3, le=1e6)] | None = None
+    spot_noise: Annotated[float, Field(ge=0.1, le=1e4)] | None = None
     truth_columns: Count = 24  # scan vertices from which the true exitance per irradiance is computed
     truth_walks: Count = 500_000  # a column, with weight windows
     reference_noise: Annotated[float, Field(ge=0.002, le=1)] = 0.03  # rms over a reference image, of its rms light
+
+    @model_validator(mode="after")
+    def _one_budget(self) -> SimulationConfig:
+        stated = [key for key in SPOT_BUDGETS if getattr(self, key) is not None]
+        if len(stated) > 1:
+            raise ValueError(f"{' and '.join(stated)} each say what a spot costs; keep one of them")
+        return self
 
 
 class Neck(Strict):
@@ -121,8 +136,12 @@ def shrink(scene: Scene) -> Scene:
         return camera.model_copy(update={"width": width, "height": height, "pixel_pitch_um": pitch})
 
     walks = scene.simulation
+    stated = (walks.walks_per_spot, walks.spot_seconds, walks.spot_noise)
+    plain = DEFAULT_WALKS if stated == (None, None, None) else walks.walks_per_spot
     simulation = SimulationConfig(
-        walks_per_spot=max(1000, walks.walks_per_spot // 10),
+        walks_per_spot=None if plain is None else max(1000, plain // 10),
+        spot_seconds=None if walks.spot_seconds is None else max(1e-3, walks.spot_seconds / 10),
+        spot_noise=None if walks.spot_noise is None else min(1e4, walks.spot_noise * math.sqrt(10)),
         truth_columns=min(walks.truth_columns, max(4, walks.truth_columns // 4)),
         truth_walks=max(1000, walks.truth_walks // 10),
         reference_noise=max(walks.reference_noise, min(0.1, walks.reference_noise * math.sqrt(10))),

@@ -2,7 +2,7 @@
 
 Rationale: a resumed capture must equal an uninterrupted one bit for bit, on any number of cores.
 
-Expected behaviour: images, their variances and deposits are equal, not merely close. The energy balance is summed in
+Expected behaviour: images and deposits are equal, not merely close. The energy balance is summed in
 double precision in an order that depends on the lanes, so it is equal up to rounding only.
 """
 
@@ -63,7 +63,7 @@ def trace(transport: Transport, which: Sequence[int] = range(SPOTS), **key: Any)
 
 
 def assert_same(a: Traced, b: Traced, part: slice | int = slice(None)) -> None:
-    for name in ("images", "variance", "deposits"):
+    for name in ("images", "deposits"):
         one, other = getattr(a, name)[part], getattr(b, name)
         different = np.count_nonzero(one != other)
         assert different == 0, f"{different} of {other.size} {name} differ"

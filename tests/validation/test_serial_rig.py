@@ -9,6 +9,7 @@ from replay import read_log
 
 from disco_twin.emulation.emulated_rig import Emulation
 from disco_twin.emulation.twin_rig import TwinRig
+from disco_twin.evaluate.simulation_noise import spot_cost
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.faults.actual_rig import actual_rig
 from disco_twin.scene.scene import load_scene
@@ -31,7 +32,7 @@ def test_quick_through_serial_lines_equals_the_direct_twin(repository: Path, tmp
     actual = actual_rig(scene.rig, scene.seed)
 
     def twin() -> TwinRig:
-        walks, light = scene.simulation.walks_per_spot, tmp_path / "light"
+        walks, light = spot_cost(experiment).walks, tmp_path / "light"
         responses = SpotResponses(transport, scene.rig, actual, walks, experiment.seed("spots"), light)
         return TwinRig(scene.rig, responses, scene.seed, actual)
 

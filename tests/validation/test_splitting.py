@@ -54,18 +54,54 @@ def test_splitting_is_unbiased(kind: str, g: float) -> None:
     assert here[:, dark].var(axis=0).sum() * few < 0.25 * there[:, dark].var(axis=0).sum() * many
 
 
+@pytest.mark.parametrize(("kind", "g"), [("rough", 0.0), pytest.param("matched", 0.4, marks=pytest.mark.slow)])
+def test_plain_and_split_walks_make_one_image(kind: str, g: float) -> None:
+    """Rationale: each counts what it connects by a share that depends on the place; a share that differs between the
+    two techniques of a path, or does not add up to one, moves energy.
+
+    Expected behaviour: their sum equals the plain walk's images, by decade of light in each camera and block by block;
+    both with the windows that are used and with targets drawn at random. Each alone shows less.
+    """
+    views = [camera(place, 13.0, 24) for place in VIEWS]
+    for targets in ("made", "random"):
+        transport = Transport(bumpy(kind, g=g), cells=64)
+        if targets == "random":
+            random_window(transport, -7.0, 7.0, (-1.5, 0.0))
+        parts: dict[str, F64] = {}
+        for part, walks in ((None, 12_000), ("plain", 6_000), ("split", 1_500)):
+            split = None if part is None else Splitting(ENTRY, 4.0, part, 4.0)  # type: ignore[arg-type]
+            traced = transport.trace(
+                beam(REPLICATES, **SPOT), REPLICATES, walks, seed=87 + len(parts), cameras=views, split=split
+            )  # type: ignore[arg-type]
+            assert traced.images is not None
+            parts[part or "whole"] = traced.images[:, 0, :, 0].astype(float)
+        whole, joined = parts["whole"], parts["plain"] + parts["split"]
+        assert 0.05 < parts["split"].sum() / joined.sum() < 0.95
+        busy = blocks((whole > 0).mean(axis=0), 6) > 8
+        assert busy.sum() > 15
+        cut = [blocks(image, 6)[:, busy] for image in (whole, joined)]
+        assert_z(z_of_difference(*cut), f"{kind}, {targets}: blocks")
+        level = whole[::2].mean(axis=0) / whole[::2].mean(axis=0).max()  # not of those that are compared: that selects
+        for decade in range(3):
+            part_of = (level <= 10.0**-decade) & (level > 10.0 ** -(decade + 1))
+            sums = [np.where(part_of, image, 0.0).sum(axis=(-1, -2)) for image in (whole[1::2], joined)]
+            assert_z(z_of_difference(*sums), f"{kind}, {targets}: decade -{decade}")
+
+
 def random_window(transport: Transport, low: float, high: float, exponents: tuple[float, float]) -> None:
     """Let every trace with windows use targets drawn at random, cell by cell, on the cube from `low` to `high` mm."""
     cells = 24
     targets = 10 ** np.random.default_rng(3).uniform(*exponents, cells**3)
 
-    def window(*_: object) -> Window:
+    def window(_: object, split: Splitting, __: int) -> Window:
         return Window(
             target=to_float(targets),
             maps=dr.zeros(mi.UInt32, REPLICATES),
             cells=cells,
             low=opaque3(mi.Point3f, np.full(3, low)),
             inverse_cell=dr.opaque(mi.Float, cells / (high - low)),
+            part=split.part,
+            plain=dr.opaque(mi.Float, split.plain),
         )
 
     transport._window = window  # type: ignore[method-assign]

@@ -82,26 +82,31 @@ def test_smoother_boundaries_and_many_cameras_ask_for_more_walks(scene: Scene) -
 def test_plan_says_how_many_walks(scene: Scene, tmp_path: Path) -> None:
     """Expected behaviour: the plan of the quick scene names its walks, and those that bury their noise."""
     lines = dict(predict(Experiment(scene), tmp_path))
-    assert f"with {scene.simulation.walks_per_spot} walks a spot" in lines["noise"]
-    assert f"{walks_below_camera(scene):.1e} bring it below" in lines["noise"]
+    assert f"the time of {scene.simulation.walks_per_spot} plain walks a spot" in lines["noise"]
+    assert f"{walks_below_camera(scene):.1e} plain walks bring it below" in lines["noise"]
 
 
-def test_measured_noise_reads_the_variances(scene: Scene, tmp_path: Path) -> None:
-    """Expected behaviour: with variances made to be four times the camera's, twice its noise, everywhere above it, and
-    four times the walks to mend it; nothing where nothing was simulated.
+def test_measured_noise_is_how_the_halves_differ(scene: Scene, tmp_path: Path) -> None:
+    """Expected behaviour: halves drawn with a variance that leaves their mean twice the camera's deviation: twice, in
+    every decade, above it everywhere but where no light arrived, which counts as above ten; nothing where nothing was
+    simulated.
     """
     assert measured_noise(scene, tmp_path) is None
-    sensor = lars3_sensor(scene.rig)
-    camera = PinholeCamera.from_config(scene.rig.cameras[0])
-    mean = np.random.default_rng(2).uniform(1e-9, 1e-4, (3, 2, len(scene.rig.lasers), 8, camera.width))
-    mean[..., :9] = 0.0
-    variance = np.zeros_like(mean)
+    sensor, rng = lars3_sensor(scene.rig), np.random.default_rng(2)
+    light = np.broadcast_to(np.geomspace(3e-3, 3e-6, 80), (3, 2, len(scene.rig.lasers), 60, 80)).copy()
+    halves = np.stack([light, light])
     for k, laser in enumerate(scene.rig.lasers):
         watts = laser.power_mw * 1e-3
-        variance[:, :, k] = 4 * expected_variance(watts * mean[:, :, k], sensor, k) / watts**2
-    np.save(tmp_path / "spots-1.npy", np.stack([mean, variance]).astype(np.float32))
+        deviation = np.sqrt(2 * 4 * expected_variance(watts * light[:, :, k], sensor, k)) / watts
+        halves[:, :, :, k] += deviation * rng.standard_normal(halves[:, :, :, k].shape)
+    assert (halves > 0).all()
+    halves[:, 0, :, :, :12] = 0.0  # of the first spot alone: the other two show that the object is there
+    np.save(tmp_path / "spots-1.npy", halves.astype(np.float32))
     found = measured_noise(scene, tmp_path)
     assert found is not None
-    assert found["median_over_camera"] == pytest.approx(2.0, rel=1e-3)
-    assert found["above_camera"] == 1.0
-    assert found["walks_below_camera"] == pytest.approx(4 * scene.simulation.walks_per_spot, rel=1e-3)
+    assert found["median_over_camera"] == pytest.approx(2.0, rel=0.03)
+    assert found["unreached_object"] == pytest.approx(12 / 60 / 3)
+    assert found["above_ten_object"] == found["unreached_object"]
+    assert found["above_camera_object"] > 0.99
+    for decade in ("0", "-1", "-2"):
+        assert found["by_decade"][decade]["over_camera"] == pytest.approx(2.0, rel=0.05)

@@ -9,12 +9,19 @@ import pytest
 from scene_texts import GOOD
 
 from disco_twin.cli.app import main
+from disco_twin.evaluate.simulation_noise import spot_cost
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.references import shipped_references
-from disco_twin.run.cost_prediction import predict, simulation_seconds
+from disco_twin.run import cost_prediction
+from disco_twin.run.cost_prediction import predict
 from disco_twin.scene.scene import load_scene
 
 SCENE = Path(__file__).parents[4] / "scenes" / "quick.toml"
+
+
+def simulation_seconds(experiment: Experiment, lights: int, cores: int) -> dict[str, float]:
+    """Of the scene as it is."""
+    return cost_prediction.simulation_seconds(experiment, spot_cost(experiment), lights, cores)
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +49,10 @@ def test_a_stage_takes_as_long_as_its_walks(experiment: Experiment, key: str, st
     """Expected behaviour: three times the walks, three times that stage, and no other; half the cores, twice all."""
     once = simulation_seconds(experiment, 7, 2)
     more = simulation_seconds(changed(experiment, **{key: 3 * getattr(experiment.scene.simulation, key)}), 7, 2)
+    exposures = {"capture": 2 * len(experiment.plan) * cost_prediction.EXPOSURE_S / 2}  # twice: they stay as they are
     for name, value in once.items():
-        assert more[name] == pytest.approx((3 if name == stage else 1) * value)
+        expected = 3 * value - exposures.get(name, 0.0) if name == stage else value
+        assert more[name] == pytest.approx(expected)
     assert simulation_seconds(experiment, 7, 1) == pytest.approx({name: 2 * value for name, value in once.items()})
     assert simulation_seconds(experiment, 14, 2)["references"] == pytest.approx(2 * once["references"])
 
@@ -71,8 +80,22 @@ def test_wavelengths_that_scatter_alike_share_their_walks(experiment: Experiment
     own[2] *= 1.2
     apart = changed(experiment)
     vars(apart).update(object=replace(experiment.object, medium=replace(medium, sigma_t=own)))
-    once = simulation_seconds(experiment, 7, 2)
-    assert simulation_seconds(apart, 7, 2) == pytest.approx({name: 3 * value for name, value in once.items()})
+    once, three = spot_cost(experiment), spot_cost(apart)
+    assert three.seconds / three.walks == pytest.approx(3 * once.seconds / once.walks, rel=0.15)  # denser, too
+
+
+def test_a_budget_is_walks_seconds_or_noise(experiment: Experiment) -> None:
+    """Expected behaviour: each key is met by what is predicted of the others; a quarter of the noise, 16 times the
+    walks.
+    """
+    stated = spot_cost(experiment)
+    assert stated.walks == experiment.scene.simulation.walks_per_spot
+    timed = spot_cost(changed(experiment, walks_per_spot=None, spot_seconds=3 * stated.seconds))
+    assert timed.walks == pytest.approx(3 * stated.walks, rel=1e-3)
+    finer = spot_cost(changed(experiment, walks_per_spot=None, spot_noise=stated.median / 4))
+    assert finer.walks == pytest.approx(16 * stated.walks, rel=1e-3)
+    assert finer.median == pytest.approx(stated.median / 4, rel=1e-3)
+    assert all(finer.by_decade[decade] < noise / 3.9 for decade, noise in stated.by_decade.items())
 
 
 def test_references_beside_the_scene_cost_nothing(experiment: Experiment, tmp_path: Path) -> None:
