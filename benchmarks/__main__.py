@@ -25,6 +25,7 @@ REGISTRY = {
     "faults": "benchmarks.faults",
     "irradiance": "benchmarks.irradiance",
     "laser-safety": "benchmarks.laser_safety",
+    "noise": "benchmarks.noise",
     "pareto": "benchmarks.pareto",
     "reconstruct": "benchmarks.reconstruct",
     "references": "benchmarks.references",

@@ -74,10 +74,11 @@ def capture_frames(folder: Path, spots: int, walks: int, angles: int = 3, vertic
     experiment = Experiment(scene.model_copy(update={"rig": rig(1), "scan": scan}))
     transport = experiment.transport
     from disco_twin.light.response import SpotResponses
+    from disco_twin.light.spot_walks import SpotWalks
 
     def responses(factor: int) -> SpotResponses:
         return SpotResponses(
-            transport, rig(factor), actual_rig(rig(factor), scene.seed), walks, SEED, folder / "responses"
+            transport, rig(factor), actual_rig(rig(factor), scene.seed), SpotWalks(walks), SEED, folder / "responses"
         )
 
     twin = TwinRig(rig(1), Interpolated(responses(FACTOR), responses(1)), scene.seed)

@@ -8,6 +8,7 @@ The camera's own variance is known for every radiance. Decades are those of ligh
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,9 @@ from disco_twin.camera.sensor import expected_variance
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.light import MOST_CAMERAS
 from disco_twin.light.importance import Diffusion, diffusion
-from disco_twin.light.spot_walks import photon_density, walk_seconds
+from disco_twin.light.spot_walks import SpotWalks, photon_density, walk_seconds
 from disco_twin.scene.scene import DEFAULT_WALKS, Scene
-from hw.base.arrays import F64
+from hw.base.arrays import F32, F64, I64
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.mesh import RayMesh
 
@@ -64,11 +65,13 @@ def walks_below_camera(scene: Scene) -> float:
 
 @dataclass(frozen=True)
 class SpotCost:
-    """What a spot's light takes, as the scene states it. walks: as the time of so many plain ones; seconds: of a core;
-    median, by_decade: the simulation's predicted deviation over the camera's, within a factor of three.
+    """What a spot's light takes, as the scene states it. time_walks: the time of so many plain ones; walks: those that
+    are made of it; seconds: of a core; median, by_decade: the simulation's predicted deviation over the camera's,
+    within a factor of three.
     """
 
-    walks: int
+    time_walks: int
+    walks: SpotWalks
     seconds: float
     median: float
     by_decade: dict[str, float]
@@ -80,8 +83,8 @@ def spot_cost(experiment: Experiment) -> SpotCost:
     Raises: InputError as `build_object`.
     """
     work = experiment.scene.simulation
-    estimate = diffusion(experiment.object, int(np.argmin(_absorption(experiment))), CELLS)
-    places = _lit_places(experiment)
+    estimate = coarse_estimate(experiment)
+    places = experiment.scan.vertices[lit_vertices(experiment)]
     each = walk_seconds(experiment.object, estimate.collisions(places))
     median, by_decade = _predicted_noise(experiment, estimate, places)
     if work.spot_seconds is not None:
@@ -92,21 +95,24 @@ def spot_cost(experiment: Experiment) -> SpotCost:
         walks = float(work.walks_per_spot or DEFAULT_WALKS)
     count = int(min(max(round(walks), 1), MOST_WALKS))
     scale = math.sqrt(PROBE_WALKS / count)
-    return SpotCost(count, count * each, scale * median, {d: scale * x for d, x in by_decade.items()})
+    parts = SpotWalks.of(count, work.split_share)
+    return SpotCost(count, parts, count * each, scale * median, {d: scale * x for d, x in by_decade.items()})
 
 
-def _absorption(experiment: Experiment) -> list[float]:
+def coarse_estimate(experiment: Experiment) -> Diffusion:
+    """The diffusion estimate at the wavelength that is absorbed least, good enough to predict time and noise."""
     medium = experiment.object.medium
-    return [float((s * (1 - a)).mean()) for s, a in zip(medium.sigma_t, medium.albedo, strict=True)]
+    absorbed = [float((s * (1 - a)).mean()) for s, a in zip(medium.sigma_t, medium.albedo, strict=True)]
+    return diffusion(experiment.object, int(np.argmin(absorbed)), CELLS)
 
 
-def _lit_places(experiment: Experiment) -> F64:
-    """(SPOTS, 3) vertices of the scan that face the projector, evenly spread over their list."""
+def lit_vertices(experiment: Experiment) -> I64:
+    """(SPOTS,) vertices of the scan that face the projector, evenly spread over their list."""
     scan = experiment.scan
     towards = np.array(experiment.scene.rig.projector.position_mm) - scan.vertices
     facing = np.flatnonzero((towards * scan.vertex_normals).sum(axis=1) > 0.3 * np.linalg.norm(towards, axis=1))
     facing = facing if len(facing) else np.arange(len(scan.vertices))
-    return np.asarray(scan.vertices[facing[np.linspace(0, len(facing) - 1, SPOTS).round().astype(int)]])
+    return np.asarray(facing[np.linspace(0, len(facing) - 1, SPOTS).round().astype(int)])
 
 
 def _predicted_noise(experiment: Experiment, estimate: Diffusion, places: F64) -> tuple[float, dict[str, float]]:
@@ -115,7 +121,9 @@ def _predicted_noise(experiment: Experiment, estimate: Diffusion, places: F64) -
     fluence = estimate.fluence(places)
     at = estimate.unknowns(scan.vertices)
     light = fluence[:, estimate.filled][:, at] * estimate.leak / np.pi
-    density = photon_density(estimate, fluence, PROBE_WALKS)[:, estimate.filled][:, at]
+    density = photon_density(estimate, fluence, SpotWalks.of(PROBE_WALKS, scene.simulation.split_share))[
+        :, estimate.filled
+    ][:, at]
     size, area = np.zeros(len(scan.vertices)), RayMesh.of(scan).vertex_areas
     for camera in map(PinholeCamera.from_config, scene.rig.cameras):
         towards = camera.position - scan.vertices
@@ -145,21 +153,28 @@ def _median(values: F64, weight: F64) -> float:
 
 
 def measured_noise(scene: Scene, responses: Path) -> dict[str, Any] | None:
-    """The simulated spots' noise, from how their independent halves differ, beside the camera's; None without any.
-
-    Of all pixels that show the object (that light reached in any spot of a file): median_over_camera of the ratio of
-    the deviations, the shares where it is above one and above ten, and the share that no light reached, which counts as
-    above ten. A pixel's variance is the mean over BOX x BOX pixels. by_decade: of light below the spot's brightest, the
-    root mean square ratio and the share of pixels. Twice as good takes four times the walks.
-    """
+    """`noise_of` the simulated spots that a run has kept; None without any."""
     files = sorted(responses.glob("spots-*.npy"))
     if not files:
         return None
+    some = np.unique(np.linspace(0, len(files) - 1, FILES).round().astype(int))
+    return noise_of(scene, [np.load(files[index], mmap_mode="r") for index in some])
+
+
+def noise_of(scene: Scene, spots: Sequence[F32]) -> dict[str, Any] | None:
+    """The simulation's noise beside the camera's, from how the halves of the walks differ; None without light.
+
+    spots: (2, S, C, L, H, W) each, the images of some spots at one turntable angle and those of half of their walks.
+    Of all pixels that show the object (that light reached in any of them): median_over_camera and p90_over_camera of
+    the ratio of the deviations, the shares where it is above one and above ten, and the share that no light reached,
+    which counts as above ten. A pixel's variance is the mean over BOX x BOX pixels. by_decade: of light below the
+    spot's brightest, the root mean square ratio and the share of pixels.
+    """
     sensor = lars3_sensor(scene.rig)
-    found: list[tuple[F64, F64, F64]] = []  # ratio, squared ratio without averaging, decade
-    for index in np.unique(np.linspace(0, len(files) - 1, FILES).round().astype(int)):
-        halves = np.load(files[index], mmap_mode="r").astype(np.float64)
-        mean, square = halves.mean(axis=0), (0.5 * (halves[0] - halves[1])) ** 2
+    found: list[tuple[F64, F64, F64, F64]] = []  # ratio, squared ratio without averaging, decade, light
+    for arrays in spots:
+        mean, first_half = np.asarray(arrays, np.float64)
+        square = (first_half - mean) ** 2
         shown = np.broadcast_to((mean > 0).any(axis=(0, 2))[None, :, None], mean.shape)
         filled = np.maximum(_boxes(shown.astype(float)), 1e-12)
         light, variance = (np.maximum(_boxes(images), 0.0) / filled for images in (mean, square))
@@ -167,17 +182,19 @@ def measured_noise(scene: Scene, responses: Path) -> dict[str, Any] | None:
         for k, laser in enumerate(scene.rig.lasers):
             watts, part = laser.power_mw * 1e-3, shown[:, :, k]
             camera = expected_variance(watts * light[:, :, k], sensor, k) / watts**2
-            ratio = np.where(mean[:, :, k] > 0, np.sqrt(variance[:, :, k] / camera), np.inf)
-            found += [(ratio[part], (square[:, :, k] / camera)[part], decade[:, :, k][part])]
-    ratio, squared, decade = (np.concatenate([f[n] for f in found]) for n in range(3))
+            ratio = np.where(light[:, :, k] > 0, np.sqrt(variance[:, :, k] / camera), np.inf)
+            rows = ratio, square[:, :, k] / camera, decade[:, :, k], mean[:, :, k]
+            found.append(tuple(row[part] for row in rows))  # type: ignore[arg-type]
+    ratio, squared, decade, seen = (np.concatenate([f[n] for f in found]) for n in range(4))
     if not ratio.size:
         return None
-    median = float(np.median(ratio))
+    median, p90 = (float(np.quantile(ratio, q, method="lower")) for q in (0.5, 0.9))
     return {
         "median_over_camera": median if math.isfinite(median) else None,
+        "p90_over_camera": p90 if math.isfinite(p90) else None,
         "above_camera_object": float((ratio > 1).mean()),
-        "above_ten_object": float((ratio > 10).mean()),
-        "unreached_object": float(np.isinf(ratio).mean()),
+        "above_ten_object": float(((ratio > 10) | (seen == 0)).mean()),
+        "unreached_object": float((seen == 0).mean()),
         "by_decade": {
             str(-d): {"over_camera": float(np.sqrt(squared[decade == d].mean())), "share": float((decade == d).mean())}
             for d in range(DECADES)

@@ -34,8 +34,8 @@ STEEPEST = 32.0  # ratio of neighbouring cells' targets: where diffusion falls t
 class Splitting:
     """Where each tag's light enters, (T, 3) in mm, and how many times the collisions of an unsplit walk to spend.
 
-    What effort buys: docs/decisions/0050. part: of images that plain and split walks make together (`splitting.counted`)
-    whose these are, with `plain` of the former to each of the latter; their sum is the whole.
+    What effort buys: docs/decisions/0050. part: of images that plain and split walks make together
+    (`splitting.counted`) whose these are, with `plain` of the former to each of the latter; their sum is the whole.
     """
 
     entries: F64

@@ -1,8 +1,9 @@
 """The object's response to laser spots, as the twin's cameras will see it: simulated ahead, kept on disk, reused.
 
 A spot's images depend on (seed, spot) alone, not on what it was simulated together with, so an interrupted capture
-continues with the very same light. They are made by plain and by split walks together, each counted where its photons
-are dense (docs/decisions/0130), in two halves with random numbers of their own: how they differ is what the noise is.
+continues with the very same light. The halves of its walks are independent: how they differ is what the noise is. Where
+a scene asks for it, plain and split walks make the images together, each counted where its photons are dense
+(docs/decisions/0130).
 """
 
 from __future__ import annotations
@@ -20,8 +21,7 @@ from numpy.typing import ArrayLike
 from disco_twin.faults.actual_rig import ActualRig
 from disco_twin.light.importance import Splitting
 from disco_twin.light.sources import BeamSource, Source
-from disco_twin.light.splitting import Part
-from disco_twin.light.spot_walks import EFFORT, HALVES, part_walks
+from disco_twin.light.spot_walks import EFFORT, SpotWalks
 from disco_twin.light.transport import Transport
 from disco_twin.object.build import TwinObject
 from hw.base.arrays import F32, F64
@@ -57,13 +57,13 @@ def light_key(obj: TwinObject, config: RigConfig, actual: ActualRig) -> str:
 class SpotResponses:
     """Implements `disco_twin.emulation.twin_rig.ResponseSource` by the photon walk.
 
-    Each chunk of spots is one file `spots-<name>.npy` in `scratch`, (HALVES, spots, C, L, H, W) float32 radiance per
-    watt, whose mean is the image. walks: what a spot may cost, as the time of so many plain walks. `code` is the key of
-    the code that simulates: what other code left is not read.
+    Each chunk of spots is one file `spots-<name>.npy` in `scratch`, (2, spots, C, L, H, W) float32 radiance per
+    watt: the image, and that of the first half of its walks. `code` is the key of the code that simulates: what other
+    code left is not read.
     """
 
     def __init__(
-        self, transport: Transport, config: RigConfig, actual: ActualRig, walks: int, seed: int, scratch: Path,
+        self, transport: Transport, config: RigConfig, actual: ActualRig, walks: SpotWalks, seed: int, scratch: Path,
         code: str = "",
     ) -> None:  # fmt: skip
         self.transport, self.config, self.actual = transport, config, actual
@@ -86,7 +86,7 @@ class SpotResponses:
 
     def image(self, camera: int, aim: Aim, laser: int) -> F32:
         """(H, W) radiance per watt in W/(mm^2 sr)."""
-        return np.asarray(self._spot(aim)[:, camera, laser].mean(axis=0))
+        return self._spot(aim)[0, camera, laser]
 
     def _spot(self, aim: Aim) -> F32:
         if aim not in self._chunk_of:
@@ -109,27 +109,27 @@ class SpotResponses:
         return np.asarray(np.load(path, mmap_mode="r"))
 
     def _simulate(self, chunk: tuple[Aim, ...]) -> F32:
-        origins, directions = (np.tile(rays, (HALVES, 1)) for rays in self.actual.spot_rays(chunk))
-        beam, tags = self.config.projector, HALVES * len(chunk)
-        entries = places_of_entry(self.transport, origins, directions)
-        plain, split = part_walks(self.walks)
+        origins, directions = self.actual.spot_rays(chunk)
+        beam, cameras = self.config.projector, self.views[chunk[0].angle]
 
         def source(group: Sequence[int]) -> Source:
-            return BeamSource(
-                origins, directions, beam.beam_diameter_mm / 2, np.ones((tags, len(group))), beam.beam_profile
-            )
+            power = np.ones((len(chunk), len(group)))
+            return BeamSource(origins, directions, beam.beam_diameter_mm / 2, power, beam.beam_profile)
 
-        def images(part: Part, walks: int) -> F32:
-            names = [zlib.crc32(repr((aim, half, part)).encode()) for half in range(HALVES) for aim in chunk]
+        def images(walks: int, kind: str = "", split: Splitting | None = None) -> F32:
+            names = np.array([zlib.crc32(f"{aim!r}{kind}".encode()) for aim in chunk], np.uint32)
             traced = self.transport.trace(
-                source, tags, walks, seed=self.seed, streams=np.array(names, np.uint32),
-                cameras=self.views[chunk[0].angle], split=Splitting(entries, EFFORT, part, plain / split),
-            )  # fmt: skip
-            assert traced.images is not None
-            return traced.images[:, 0]
+                source, len(chunk), walks, seed=self.seed, streams=names, cameras=cameras, split=split, halve=True
+            )
+            assert traced.images is not None and traced.first_half is not None
+            return np.stack([traced.images[:, 0], traced.first_half[:, 0]])
 
-        total = images("plain", plain) + images("split", split)
-        return total.reshape(HALVES, len(chunk), *total.shape[1:])
+        if not self.walks.split:
+            return images(self.walks.plain)
+        entries, ratio = places_of_entry(self.transport, origins, directions), self.walks.plain / self.walks.split
+        return images(self.walks.plain, "", Splitting(entries, EFFORT, "plain", ratio)) + images(
+            self.walks.split, "split", Splitting(entries, EFFORT, "split", ratio)
+        )
 
     def silhouette(self, camera: int, angle: int) -> F32:
         """(H, W) radiance of the object, dusted white, under floodlights around the camera; the background is dark."""

@@ -1,10 +1,12 @@
 """How a spot's time is shared among plain and split walks, and how long a walk takes. Needs no renderer.
 
 Near the spot split walks show no more than plain ones and take longer; far from it they carry what plain walks hardly
-reach. Both make a spot's images together (docs/decisions/0130).
+reach. Where a scene asks for both they make a spot's images together (docs/decisions/0130).
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,17 +14,24 @@ from disco_twin.light.importance import Diffusion, window_targets
 from disco_twin.object.build import TwinObject
 from hw.base.arrays import F64
 
-HALVES = 2  # of a spot's light, with random numbers of their own
-SPLIT_SHARE = 0.4  # of a spot's time that split walks take
-EFFORT, SPLIT_COST = 3.0, 3.7  # a split walk takes as long as so many plain ones
+EFFORT, SPLIT_COST = 3.0, 4.5  # a split walk takes as long as so many plain ones of `quick`; in dense media longer
 LIGHTEST = 0.01  # target weight below which copies, which are correlated, tell no more
 # Processor seconds of a plain walk with cameras: of its start and of a collision (docs/decisions/0130).
 START_S, COLLISION_S = 3.0e-6, 0.24e-6
 
 
-def part_walks(walks: int) -> tuple[int, int]:
-    """Plain and split walks of each half that together take as long as `walks` plain ones."""
-    return max(1, round((1 - SPLIT_SHARE) * walks / HALVES)), max(1, round(SPLIT_SHARE * walks / SPLIT_COST / HALVES))
+@dataclass(frozen=True)
+class SpotWalks:
+    """How many walks a spot's images are made of."""
+
+    plain: int
+    split: int = 0
+
+    @classmethod
+    def of(cls, walks: int, split_share: float) -> SpotWalks:
+        """Such that all take as long as `walks` plain ones, the split ones that share of the time."""
+        split = round(split_share * walks / SPLIT_COST)
+        return cls(max(1, round((1 - split_share) * walks)), split)
 
 
 def walk_seconds(obj: TwinObject, collisions: float) -> float:
@@ -31,8 +40,9 @@ def walk_seconds(obj: TwinObject, collisions: float) -> float:
     return groups * (START_S + COLLISION_S * collisions)
 
 
-def photon_density(estimate: Diffusion, fluence: F64, walks: int) -> F64:
+def photon_density(estimate: Diffusion, fluence: F64, walks: SpotWalks) -> F64:
     """(N, n, n, n) photons that carry a launched one's power at each place, for spots of `fluence` (N, n, n, n)."""
-    plain, split = part_walks(walks)
+    if not walks.split:
+        return np.full_like(fluence, walks.plain)
     targets = np.maximum(window_targets(fluence, estimate.filled, EFFORT), LIGHTEST)
-    return HALVES * (plain + split / targets)
+    return walks.plain + walks.split / targets

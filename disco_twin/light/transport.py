@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -49,11 +49,13 @@ class CameraLobe:
 class Traced:
     """What a trace measured, per watt of the source's own power scale.
 
-    images: (T, layers, C, L, H, W) float32 radiance [1/(mm^2 sr) per W launched]
-    deposits: (T, L, V) float64 power that left at each vertex's hat function; either is None if not asked for
+    images: (T, layers, C, L, H, W) float32 radiance [1/(mm^2 sr) per W launched]; first_half: the same of the first
+        half of the walks, which is independent of the second
+    deposits: (T, L, V) float64 power that left at each vertex's hat function; each is None if not asked for
     """
 
     images: F32 | None
+    first_half: F32 | None
     deposits: F64 | None
     balance: EnergyBalance
 
@@ -222,6 +224,7 @@ class Transport:
         first: int = 0,
         lanes: int = LANES,
         split: Splitting | Views | None = None,
+        halve: bool = False,
         even: bool = False,
         shine: bool = False,
     ) -> Traced:
@@ -230,14 +233,15 @@ class Transport:
         make_source: (group of laser indices) -> Source. sky: (group) -> light for walks that start at pixels, in place
         of cameras; images are (T, layers, 1, L, 1, 1) then. streams: (T,) names of the tags' random streams, so that a
         spot gives the same image whatever it is traced together with; 0, 1, 2, ... by default. split: weight windows,
-        which make faint light as precise as bright, or lead to what the cameras see (importance.py). even: connections
-        are (connect.py). shine: the surface reflects light and lets none in.
+        which make faint light as precise as bright, or lead to what the cameras see (importance.py). halve: keep the
+        images of the first half of the walks, too. even: connections are (connect.py). shine: the surface reflects
+        light and lets none in.
         """
         streams = np.arange(tags, dtype=np.uint32) if streams is None else streams.astype(np.uint32)
         parts = [
             self._trace_group(
                 make_source(group), group, tags, walks, seed, streams, cameras, sky(group) if sky else None, layers,
-                deposit, first, lanes, split, even, shine,
+                deposit, first, lanes, split, halve, even, shine,
             )
             for group in self.groups
         ]  # fmt: skip
@@ -252,12 +256,12 @@ class Transport:
         names = EnergyBalance.__dataclass_fields__
         balance = EnergyBalance(**{k: np.concatenate([getattr(p.balance, k) for p in parts])[order] for k in names})
         balance.warn_of_loss()
-        return Traced(join("images", 3), join("deposits", 1), balance)
+        return Traced(join("images", 3), join("first_half", 3), join("deposits", 1), balance)
 
     def _trace_group(
         self, source: Source, group: tuple[int, ...], tags: int, walks: int, seed: int, streams: NDArray[np.uint32],
         cameras: Sequence[PinholeCamera], sky: EnvironmentSource | None, layers: int, deposit: bool, first: int,
-        lanes: int, split: Splitting | Views | None, even: bool, shine: bool,
+        lanes: int, split: Splitting | Views | None, halve: bool, even: bool, shine: bool,
     ) -> Traced:  # fmt: skip
         tables = kernel.Tables(**vars(self._tables(group)) | {"even": even, "shine": shine})
         table = camera_table(cameras) if cameras else None
@@ -269,7 +273,7 @@ class Transport:
         names = mi.UInt32(streams)
         window = self._window(group, split, tags) if split is not None else None
         total = {name: np.zeros(len(group)) for name in Tally.__dataclass_fields__}
-        images, deposits = [], []
+        images, first_half, deposits = [], [], []
         for low in range(0, tags, batch):
             n = min(batch, tags - low)
             shape = (n, layers, *layout)
@@ -277,8 +281,9 @@ class Transport:
             pictures = new_images(layers, int(np.prod(shape)), source.scale * unit) if layout else None
             powers = new_deposits(n * len(group) * len(self.vertices), walks) if deposit else None
             step = max(1, min(walks, PHOTONS_PER_CALL // n))
-            for start in range(0, walks, step):
-                m = min(step, walks - start)
+            for start, m in stretches(walks, step):
+                if start == walks // 2 and pictures is not None and halve:
+                    first_half.append(read_images(pictures, shape, max(start, 1)))
                 balance = walk(
                     tables, source, table, met, pictures, powers, dr.opaque(mi.UInt32, n * m), dr.opaque(mi.UInt32, m),
                     dr.opaque(mi.UInt32, first + start), dr.opaque(mi.UInt32, low), names,
@@ -296,9 +301,17 @@ class Transport:
         scale = 1.0 / (tags * walks)
         return Traced(
             np.concatenate(images) if images else None,
+            np.concatenate(first_half) if first_half else None,
             np.concatenate(deposits) if deposits else None,
             EnergyBalance(**{name: value * scale for name, value in total.items()}),
         )
+
+
+def stretches(walks: int, step: int) -> Iterator[tuple[int, int]]:
+    """(first, number) of at most `step` walks each, all of `walks`; one starts at half of them."""
+    for low, high in ((0, walks // 2), (walks // 2, walks)):
+        for start in range(low, high, step):
+            yield start, min(step, high - start)
 
 
 def wavelength_groups(medium: Medium) -> tuple[tuple[int, ...], ...]:

@@ -6,10 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
-from disco_twin.evaluate.simulation_noise import SpotCost, spot_cost, walks_below_camera
+from disco_twin.evaluate.simulation_noise import (
+    SpotCost,
+    coarse_estimate,
+    lit_vertices,
+    spot_cost,
+    walks_below_camera,
+)
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.omissions import left_out_by_the_twin
 from disco_twin.experiment.references import holds_reference
+from disco_twin.light.importance import window_targets
+from disco_twin.light.spot_walks import EFFORT
 from hw.base.resources import usable_cores
 from pipeline.plan.targets import make_targets
 
@@ -30,13 +38,27 @@ def simulation_seconds(experiment: Experiment, spot: SpotCost, lights: int, core
     """
     work, plan = experiment.scene.simulation, experiment.plan
     images = sum(view.width * view.height for view in experiment.scene.relight.views) / (2 * 192 * 124)  # of quick's
-    walk = spot.seconds / spot.walks
+    walk = spot.seconds / spot.time_walks
     exposures = len(plan) * EXPOSURE_S
     return {
         "capture": (len(plan.spots) * spot.seconds + exposures) / cores,
-        "truth": work.truth_columns * work.truth_walks * TRUTH_COST * walk / cores,
+        "truth": work.truth_columns * work.truth_walks * TRUTH_COST * walk * copies_at_start(experiment) / cores,
         "references": lights * REFERENCE_WALKS * walk * images * (0.03 / work.reference_noise) ** 2 / cores,
     }
+
+
+def copies_at_start(experiment: Experiment) -> float:
+    """Into how many copies a photon of the truth's columns is split where it starts, in the mean: light enters over a
+    whole hat function, its windows are made for the middle of it. Many where light dies within one.
+    """
+    estimate, scan = coarse_estimate(experiment), experiment.scan
+    chosen = lit_vertices(experiment)
+    targets = window_targets(estimate.fluence(scan.vertices[chosen]), estimate.filled, EFFORT)[:, estimate.filled]
+    found = []
+    for vertex, target in zip(chosen, targets, strict=True):
+        middles = (scan.vertices[vertex] + scan.vertices[scan.vertex_neighbors[vertex]]) / 2
+        found.append((1 / target[estimate.unknowns(middles)]).mean())
+    return float(np.mean(found))
 
 
 def predict(experiment: Experiment, shipped: Path) -> list[tuple[str, str]]:
@@ -72,9 +94,9 @@ def predict(experiment: Experiment, shipped: Path) -> list[tuple[str, str]]:
     lines.append(
         (
             "noise",
-            f"of the simulation {spot.median:.3g} times the camera's in the median pixel, in the time of {spot.walks} "
-            f"plain walks a spot ({spot.seconds:.2g} s of a core); half of it takes four times as long, {needed:.1e} "
-            "plain walks bring it below the camera's in every pixel (all within a factor of three)",
+            f"of the simulation {spot.median:.3g} times the camera's in the median pixel, in the time of "
+            f"{spot.time_walks} plain walks a spot ({spot.seconds:.2g} s of a core); half of it takes four times as "
+            f"long, {needed:.1e} plain walks bring it below the camera's in every pixel (all within a factor of three)",
         )
     )
     by_decade = ", ".join(f"{decade}: {ratio:.3g}" for decade, ratio in spot.by_decade.items())

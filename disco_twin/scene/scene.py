@@ -33,6 +33,8 @@ class SimulationConfig(Strict):
     walks_per_spot: Count | None = None
     spot_seconds: Annotated[float, Field(ge=1e-3, le=1e6)] | None = None
     spot_noise: Annotated[float, Field(ge=0.1, le=1e4)] | None = None
+    # Of that time, for walks whose photons are split towards the dark: faint light is less noisy, the spot more so.
+    split_share: Annotated[float, Field(ge=0, le=0.9)] = 0.0
     truth_columns: Count = 24  # scan vertices from which the true exitance per irradiance is computed
     truth_walks: Count = 500_000  # a column, with weight windows
     reference_noise: Annotated[float, Field(ge=0.002, le=1)] = 0.03  # rms over a reference image, of its rms light
@@ -139,6 +141,7 @@ def shrink(scene: Scene) -> Scene:
     stated = (walks.walks_per_spot, walks.spot_seconds, walks.spot_noise)
     plain = DEFAULT_WALKS if stated == (None, None, None) else walks.walks_per_spot
     simulation = SimulationConfig(
+        split_share=walks.split_share,
         walks_per_spot=None if plain is None else max(1000, plain // 10),
         spot_seconds=None if walks.spot_seconds is None else max(1e-3, walks.spot_seconds / 10),
         spot_noise=None if walks.spot_noise is None else min(1e4, walks.spot_noise * math.sqrt(10)),

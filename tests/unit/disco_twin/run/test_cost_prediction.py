@@ -81,7 +81,7 @@ def test_wavelengths_that_scatter_alike_share_their_walks(experiment: Experiment
     apart = changed(experiment)
     vars(apart).update(object=replace(experiment.object, medium=replace(medium, sigma_t=own)))
     once, three = spot_cost(experiment), spot_cost(apart)
-    assert three.seconds / three.walks == pytest.approx(3 * once.seconds / once.walks, rel=0.15)  # denser, too
+    assert three.seconds / three.time_walks == pytest.approx(3 * once.seconds / once.time_walks, rel=0.15)
 
 
 def test_a_budget_is_walks_seconds_or_noise(experiment: Experiment) -> None:
@@ -89,11 +89,11 @@ def test_a_budget_is_walks_seconds_or_noise(experiment: Experiment) -> None:
     walks.
     """
     stated = spot_cost(experiment)
-    assert stated.walks == experiment.scene.simulation.walks_per_spot
+    assert stated.time_walks == experiment.scene.simulation.walks_per_spot
     timed = spot_cost(changed(experiment, walks_per_spot=None, spot_seconds=3 * stated.seconds))
-    assert timed.walks == pytest.approx(3 * stated.walks, rel=1e-3)
+    assert timed.time_walks == pytest.approx(3 * stated.time_walks, rel=1e-3)
     finer = spot_cost(changed(experiment, walks_per_spot=None, spot_noise=stated.median / 4))
-    assert finer.walks == pytest.approx(16 * stated.walks, rel=1e-3)
+    assert finer.time_walks == pytest.approx(16 * stated.time_walks, rel=1e-3)
     assert finer.median == pytest.approx(stated.median / 4, rel=1e-3)
     assert all(finer.by_decade[decade] < noise / 3.9 for decade, noise in stated.by_decade.items())
 
