@@ -39,6 +39,12 @@ BAD = [
     ('name = "c"', 'name = "a"', ["relight.views and rig.cameras", "distinct"]),
     ("vertices = 642", "vertices = 20", ["scan.vertices = 20", ">= 50"]),
     ("vertices = 642", "vertices = 50\n[simulation]\ntruth_columns = 40", ["simulation.truth_columns = 40", "half"]),
+    ("vertices = 642", "vertices = 642\n[simulation]\nspot_noise = 0.01", ["simulation.spot_noise", "0.1"]),
+    (
+        "vertices = 642",
+        "vertices = 642\n[simulation]\nwalks_per_spot = 9\nspot_noise = 5.0",
+        ["walks_per_spot and spot_noise", "keep one of them"],
+    ),
     ("[scan]", '[object.boundary]\nkind = "rough"\neta = 0.5\n[scan]', ["object.boundary.eta = 0.5", ">= 1 and <= 3"]),
     (
         "[scan]",
