@@ -184,7 +184,7 @@ def noise_of(scene: Scene, spots: Sequence[F32]) -> dict[str, Any] | None:
             camera = expected_variance(watts * light[:, :, k], sensor, k) / watts**2
             ratio = np.where(light[:, :, k] > 0, np.sqrt(variance[:, :, k] / camera), np.inf)
             rows = ratio, square[:, :, k] / camera, decade[:, :, k], mean[:, :, k]
-            found.append(tuple(row[part] for row in rows))  # type: ignore[arg-type]
+            found.append(tuple(row[part] for row in rows))
     ratio, squared, decade, seen = (np.concatenate([f[n] for f in found]) for n in range(4))
     if not ratio.size:
         return None
