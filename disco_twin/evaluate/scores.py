@@ -29,7 +29,7 @@ from pipeline.relight.scores import Unscorable, score_relit
 
 log = logging.getLogger(__name__)
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 KEPT = ("nrmse", "nrmse_se", "nrmse_floor", "psnr", "energy_ratio")
 RIM = ("nrmse", "nrmse_se")
 OUTSIDE = ("nrmse", "nrmse_se")  # against the outside reference, kept as volpath_nrmse, volpath_nrmse_se
@@ -38,10 +38,11 @@ OUTSIDE = ("nrmse", "nrmse_se")  # against the outside reference, kept as volpat
 class _Scores(Strict):
     """scores.json."""
 
-    format_version: Literal[2]
+    format_version: Literal[3]
     relit: tuple[dict[str, float | str | None], ...]
     reflectance: dict[str, dict[str, dict[str, float | None]] | None]
     totals: dict[str, dict[str, dict[str, Any]]]
+    slopes: dict[str, dict[str, Any]]
     neck: dict[str, dict[str, Any]] | None
     z: dict[str, dict[str, Any]]
 

@@ -52,6 +52,7 @@ def make_summary(
             "log10_rmse_all_by_decade": own["completed"],
             "coverage_by_decade": own["coverage"],
             "totals": scores["totals"].get(method),
+            "slopes": scores["slopes"].get(method),
         },
         "left_out": list(left_out),
     } | ({} if scores["neck"] is None else {"neck": scores["neck"]})

@@ -1,4 +1,4 @@
-"""The truth of a scene: columns of exitance per irradiance, computed a few at a time."""
+"""The truth of a scene: columns of exitance per irradiance and their angular moments, computed a few at a time."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.light.balance import EnergyBalance
+from disco_twin.light.moments import Moments, copies_of_one_laser, moments
 from disco_twin.light.truth import Truth, truth_columns
 from disco_twin.object.mesh import hat_basis
 from hw.base.arrays import I64
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from pipeline.capture.loop import Progress
 
 COLUMNS_AT_ONCE = 4  # between two reports of the progress
+MOMENT_WALKS = 1 / 8  # of the truth's, a column: slopes are one for all columns
 
 
 def true_exitance(experiment: Experiment, columns: Sequence[int] | I64, walks: int) -> Truth:
@@ -30,15 +32,30 @@ def true_exitance(experiment: Experiment, columns: Sequence[int] | I64, walks: i
     return truth_columns(experiment.transport, basis, np.asarray(columns, np.int64), walks, experiment.seed("truth"))
 
 
-def compute_truth(experiment: Experiment, path: Path, progress: Progress) -> None:
-    """Write the scene's columns of the truth, spread evenly over the surface, a few at a time."""
+def compute_truth(experiment: Experiment, folder: Path, progress: Progress) -> None:
+    """Write truth.npz, the scene's columns of the truth, spread evenly over the surface, a few at a time; and
+    moments.npz, the moments of the middle laser's light in the same columns.
+    """
     points, work, parts = np.asarray(experiment.scan.vertices, float), experiment.scene.simulation, []
     columns = np.sort(farthest_points(points, np.ones(len(points)), work.truth_columns))
     for low in range(0, len(columns), COLUMNS_AT_ONCE):
         part = columns[low : low + COLUMNS_AT_ONCE]
         parts.append(true_exitance(experiment, part, work.truth_walks))
         progress(low + len(part), len(columns))
-    _joined(parts).save(path)
+    _joined(parts).save(folder / "truth.npz")
+    true_moments(experiment, columns, MOMENT_WALKS * work.truth_walks).save(folder / "moments.npz")
+
+
+def true_moments(experiment: Experiment, columns: Sequence[int] | I64, walks: float) -> Moments:
+    """The moments of the middle laser's light over the hats of these vertices. Needs the renderer.
+
+    Raises: InputError as `hat_basis`.
+    """
+    from disco_twin.light.transport import Transport
+
+    basis, laser = hat_basis(experiment.object.mesh, experiment.scan), len(experiment.scene.rig.lasers) // 2
+    transport = Transport(copies_of_one_laser(experiment.object, laser))
+    return moments(transport, basis, np.asarray(columns, np.int64), laser, round(walks), experiment.seed("moments"))
 
 
 def _joined(parts: Sequence[Truth]) -> Truth:

@@ -92,6 +92,11 @@ class HatSource:
         self.weight, self.scale = weight_type(lasers), 1.0
 
     def launch(self, rng: Rng, tag: Any, active: Any) -> tuple[Any, Any, Any]:
+        position, direction, _ = self.arrive(rng, tag, active)
+        return position, direction, self.weight(1.0)
+
+    def arrive(self, rng: Rng, tag: Any, active: Any) -> tuple[Any, Any, Any]:
+        """Where a photon arrives, in which direction it flies, and the surface's normal there."""
         low = dr.gather(mi.UInt32, self.start, tag, active)
         high = dr.gather(mi.UInt32, self.start, tag + 1, active) - 1
         u = rng.next()
@@ -112,7 +117,7 @@ class HatSource:
         normal = dr.normalize(dr.cross(corner[1] - corner[0], corner[2] - corner[0]))
         towards = mi.Frame3f(normal).to_world(sampling.cosine_hemisphere(rng))
         position = corner[0] * b.x + corner[1] * b.y + corner[2] * b.z + normal * self.lift
-        return mi.Point3f(position), mi.Vector3f(-towards), self.weight(1.0)
+        return mi.Point3f(position), mi.Vector3f(-towards), normal
 
 
 class DirectionalSource:

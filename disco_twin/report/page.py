@@ -104,6 +104,7 @@ def light_row(relit: Sequence[Summary], light: str, methods: Sequence[str], main
 def z_rows(z: Mapping[str, Any]) -> list[tuple[str, str, Summary]]:
     """(what, how errors are taken, count and rms and share beyond 3) of all z-scores that there are."""
     rows = [(f"entries, decade {decade}", "", own) for decade, own in z.get("entries", {}).items()]
+    rows += [("slopes of the angular term", "", z["slopes"])] if "slopes" in z else []
     for part, what in (("totals", "totals of {} columns"), ("pixels", "pixels under {}")):
         for name, errors in z.get(part, {}).items():
             rows += [(what.format(name), kind, own) for kind, own in errors.items()]

@@ -14,6 +14,7 @@ from disco_twin.evaluate.simulation_noise import (
     walks_below_camera,
 )
 from disco_twin.experiment.experiment import Experiment
+from disco_twin.experiment.ground_truth import MOMENT_WALKS
 from disco_twin.experiment.omissions import left_out_by_the_twin
 from disco_twin.experiment.references import holds_reference
 from disco_twin.light.importance import window_targets
@@ -42,7 +43,13 @@ def simulation_seconds(experiment: Experiment, spot: SpotCost, lights: int, core
     exposures = len(plan) * EXPOSURE_S
     return {
         "capture": (len(plan.spots) * spot.seconds + exposures) / cores,
-        "truth": work.truth_columns * work.truth_walks * TRUTH_COST * walk * copies_at_start(experiment) / cores,
+        "truth": work.truth_columns
+        * work.truth_walks
+        * (1 + MOMENT_WALKS)
+        * TRUTH_COST
+        * walk
+        * copies_at_start(experiment)
+        / cores,
         "references": lights * REFERENCE_WALKS * walk * images * (0.03 / work.reference_noise) ** 2 / cores,
     }
 

@@ -47,7 +47,7 @@ OUTPUTS = {  # files that a finished stage leaves, as patterns in the run folder
     "scan": ("capture/scan.ply", "capture/rig.json", "capture/sensor.json"),
     "targets": TARGETS,
     "capture": CAPTURE,
-    "truth": ("twin/truth.npz",),
+    "truth": ("twin/truth.npz", "twin/moments.npz"),
     "references": REFERENCES,
     "pipeline": (
         *(f"work/{name}" for name in ("pipeline.json", "request.json", "calibration.json", "samples.npz")),
@@ -181,12 +181,11 @@ def capture_stages(run: Run) -> None:
 
 
 def truth_stages(run: Run) -> None:
-    """Ground-truth R_d and the reference images."""
+    """Ground-truth R_d, its angular moments, and the reference images."""
     from disco_twin.experiment.ground_truth import compute_truth
 
     experiment, scene, folder = run.experiment, run.scene, run.folder
-    truth = folder.twin / "truth.npz"
-    run.stage("truth", run.key("truth"), lambda report: compute_truth(experiment, truth, report), "columns")
+    run.stage("truth", run.key("truth"), lambda report: compute_truth(experiment, folder.twin, report), "columns")
     drop_outdated(folder, "references", run.key("references"))
     keys = [reference_key(scene, light, view) for light in scene.relight.lights for view in scene.relight.views]
     shipped = shipped_references(run.scene_file, scene.name)

@@ -24,7 +24,8 @@ _ROWS = 512
 class GlobalTerm(Term):
     """reflectance: (L, V_in, V_out) mm^-2, symmetric, mean over both hat functions; measured: (V, V) entries that an
     observed spot near one vertex and the other one support; variance: mm^-4, None where the method states none;
-    tilt: slopes of the `TiltLaw`s at tilt_distance, None where directions are not known to change anything
+    tilt: slopes of the `TiltLaw`s at tilt_distance, None where directions are not known to change anything;
+    tilt_variance: of the slopes, None where the method states none
     """
 
     kind: ClassVar[str] = "global"
@@ -34,6 +35,7 @@ class GlobalTerm(Term):
     variance: Annotated[F32 | None, Axes(_PAIRS, "mm^-4")] = None
     tilt: Annotated[F64 | None, Axes("laser distance", "1")] = None
     tilt_distance: Annotated[F64 | None, Axes("distance", "mm")] = None
+    tilt_variance: Annotated[F64 | None, Axes("laser distance", "1")] = None
 
     def image(self, light: LightOnMesh, view: ViewOfMesh) -> F32:
         """Radiosity on the vertices (thesis 5.3: B = E F) and its first moments, linear on the faces."""
@@ -104,6 +106,8 @@ class GlobalTerm(Term):
         distance = self.tilt_distance
         if (self.tilt is None) != (distance is None):
             raise ValueError(f"{self.kind}.tilt: slopes and their distances come together")
+        if self.tilt is None and self.tilt_variance is not None:
+            raise ValueError(f"{self.kind}.tilt_variance: is of slopes that are not there")
         if distance is not None and not (np.diff(distance, prepend=0.0) > 0).all():
             raise ValueError(f"{self.kind}.tilt_distance: is not above 0 and ascending")
         for name, array in self.arrays().items():

@@ -13,6 +13,7 @@ from disco_twin.experiment.pipeline_process import pipeline_inputs
 from disco_twin.experiment.references import reference_path
 from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.light.balance import EnergyBalance
+from disco_twin.light.moments import Moments
 from disco_twin.light.references import Reference, save_reference
 from disco_twin.light.truth import Truth
 from disco_twin.scene.scene import Scene
@@ -73,6 +74,10 @@ def write_frozen_run(root: Path) -> np.ndarray:
     entries = model.exitance_columns(columns)
     replicates = (entries.mean * (1 + 0.03 * noise.standard_normal((8, *entries.mean.shape)))).astype(np.float32)
     Truth(columns, replicates, RayMesh.of(experiment.scan).vertex_areas, balance).save(folder.twin / "truth.npz")
+    frames = np.broadcast_to(np.eye(3), (len(columns), 3, 3))
+    plain = replicates[:, 0]
+    along = np.zeros((8, 2, *plain.shape[1:]), np.float32)
+    Moments(np.asarray(0), columns, frames[:, :2], frames, plain, along).save(folder.twin / "moments.npz")
     for light in scene.relight.lights:
         for view in scene.relight.views:
             image = model.image(model.lit_by(light), model.seen_by(PinholeCamera.from_config(view)))

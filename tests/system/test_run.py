@@ -99,7 +99,9 @@ def test_summary_has_exactly_what_the_design_says(summary: dict[str, Any]) -> No
     totals = summary["reflectance"]["totals"]
     assert totals["lit"]["columns"] + totals["unlit"]["columns"] == 4
     assert [len(totals[part][key]) for part in totals for key in ("mean", "mean_se", "spread", "spread_se")] == [3] * 8
-    assert set(summary["z"]) == {"entries", "totals", "pixels"}
+    assert set(summary["z"]) == {"entries", "totals", "slopes", "pixels"}
+    slopes = summary["reflectance"]["slopes"]
+    assert len(slopes["distance_mm"]) == len(slopes["truth"]) == len(slopes["model"]) == summary["z"]["slopes"]["count"]
     assert all(0 < z["rms"] < 100 for z in summary["z"]["pixels"]["uniform"].values())
     assert all(set(item) == {"what", "because"} for item in summary["left_out"])
 

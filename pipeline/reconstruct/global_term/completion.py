@@ -103,13 +103,14 @@ class Fit:
     """One laser's smooth model.
 
     entries: (V, V) R_d, symmetric and positive; at_spots: (S, V) the same between beams and vertices; both in mm^-2,
-    means over all directions; tilt: how single directions depart from them; tilt_chi2: squares of the slopes that are
-    relit, by their covariance; field: (n, n) Y
+    means over all directions; tilt: how single directions depart from them; tilt_variance: (K,) of its slopes;
+    tilt_chi2: squares of the slopes that are relit, by their covariance; field: (n, n) Y
     """
 
     entries: F64
     at_spots: F64
     tilt: TiltLaw
+    tilt_variance: F64
     tilt_chi2: float
     field: F32
 
@@ -149,7 +150,8 @@ def fit_laser(
     entries = 0.5 * (kernel + kernel.T) * np.exp(0.5 * (exponent + exponent.T))
     kept = forward(found.tilt.slope)
     shown = float(kept @ np.linalg.solve(found.covariance, kept))
-    return Fit(entries, pairs.mean(found.profile) * np.exp(smooth), found.tilt, shown, y)
+    at_spots, variance = pairs.mean(found.profile) * np.exp(smooth), np.diag(found.covariance)
+    return Fit(entries, at_spots, found.tilt, variance, shown, y)
 
 
 def hold_measured(
@@ -255,6 +257,7 @@ def complete(samples: Samples) -> RelightableModel:
         variance,
         np.stack([forward(fit.tilt.slope) for fit in fits]) if tilted else None,
         fits[0].tilt.distance if tilted else None,
+        np.stack([fit.tilt_variance for fit in fits]) if tilted else None,
     )
     provenance = {}
     if samples.lobe is not None and not samples.lobe.because:
