@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from disco_twin.evaluate.z_scores import ZScores, honest
+from disco_twin.evaluate.z_scores import ZScores, honest, over
 from disco_twin.light.moments import Moments
 from disco_twin.light.truth import standard_error
 from disco_twin.object.build import TwinBoundary
@@ -87,13 +87,13 @@ def score_slopes(stated: tuple[F64, F64 | None], distance: F64, true: F64) -> tu
     slope, variance = stated
     mean, error = true.mean(axis=0), standard_error(true)
     noise = honest(error**2, len(true) - 1)
-    z = (slope - mean) / np.sqrt(noise if variance is None else noise + variance)
+    z = over(slope - mean, noise if variance is None else noise + variance)
     rows = {
         "distance_mm": distance.tolist(),
         "truth": mean.tolist(),
         "truth_se": error.tolist(),
         "model": slope.tolist(),
         "model_sd": None if variance is None else np.sqrt(variance).tolist(),
-        "z": z.tolist(),
+        "z": [float(own) if np.isfinite(own) else None for own in z],
     }
     return rows, ZScores.of(z)

@@ -38,7 +38,7 @@ class ZScores:
         return cls(z.size, float(np.sqrt((z**2).mean())), float((np.abs(z) > 3).mean()))
 
 
-def _over(error: Array, variance: Array) -> F64:
+def over(error: Array, variance: Array) -> F64:
     """error / sqrt(variance), NaN where there is none: no photon came, or nothing is known of how many might."""
     deviation = np.sqrt(variance, dtype=np.float64)
     out: F64 = np.full(deviation.shape, np.nan)
@@ -61,7 +61,7 @@ def z_of_entries(mean: Array, variance: Array, truth: Truth) -> dict[str, ZScore
     are left out. Raises: Unscorable where those are all.
     """
     noise = honest(truth.standard_error**2, len(truth.replicates) - 1)
-    z = _over(mean - truth.mean, variance + noise)
+    z = over(mean - truth.mean, variance + noise)
     below = below_peak(truth.mean, truth.standard_error)
     return {str(-d): ZScores.of(z[(below >= d) & (below < d + 1)]) for d in range(DECADES)}
 
@@ -76,7 +76,7 @@ def z_of_totals(mean: Array, variance: Array, truth: Truth, chosen: Bool) -> dic
     noise = honest(error**2, len(truth.replicates) - 1)
     off = mean @ truth.area - exact
     variances = {"independent": variance @ truth.area**2, "alike": (np.sqrt(variance) @ truth.area) ** 2}
-    return {name: ZScores.of(_over(off, v + noise)[:, chosen]) for name, v in variances.items()}
+    return {name: ZScores.of(over(off, v + noise)[:, chosen]) for name, v in variances.items()}
 
 
 def z_of_pixels(image: Array, variance: Array, halves: Array, mask: Bool) -> F64:
@@ -86,7 +86,7 @@ def z_of_pixels(image: Array, variance: Array, halves: Array, mask: Bool) -> F64
     of eq. 2.1 itself; halves: (2, L, H, W) of the reference
     """
     a, b = np.asarray(halves, np.float64)
-    return _over(image - 0.5 * (a + b), variance + reference_variance(a, b, mask))[:, mask]
+    return over(image - 0.5 * (a + b), variance + reference_variance(a, b, mask))[:, mask]
 
 
 def reference_variance(a: F64, b: F64, mask: Bool) -> F64:

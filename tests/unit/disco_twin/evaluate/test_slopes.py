@@ -112,3 +112,5 @@ def test_a_truth_without_light_has_no_slopes() -> None:
     distance, slopes = true_slopes(dark, POINTS, EDGE, MATCHED)
     rows, z = score_slopes((np.zeros(0), None), distance, slopes)
     assert rows["z"] == [] and z.count == 0
+    rows, z = score_slopes((np.ones(2), None), np.ones(2), np.zeros((8, 2)))  # nothing is known of its errors
+    assert rows["z"] == [None, None] and z.count == 0
