@@ -8,10 +8,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from hw.base.arrays import F32, F64, U8, U16, Bool
+
+# Bounds of what files state; they are checked where a file is read.
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
@@ -37,15 +43,15 @@ class Sensor:
         for, from 0 to 1; empty where both are the same. Below the offset it goes on as its mirror image
     """
 
-    longest_exposure_s: float
-    steps: int  # exponents run from 0 to steps - 1
-    bits: int  # the charge is digitised to 0 .. 2**bits - 1
-    gain_e_per_dn: float
-    read_noise_e: float
-    dark_e_per_s: float
-    offset_dn: float
-    responsivity: tuple[float, ...]
-    decision_e: float = 0.0
+    longest_exposure_s: Positive
+    steps: Annotated[int, Field(ge=1, le=24)]  # exponents run from 0 to steps - 1
+    bits: Annotated[int, Field(ge=1, le=16)]  # the charge is digitised to 0 .. 2**bits - 1
+    gain_e_per_dn: Positive
+    read_noise_e: NotNegative
+    dark_e_per_s: NotNegative
+    offset_dn: NotNegative
+    responsivity: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    decision_e: NotNegative = 0.0
     response: tuple[float, ...] = ()
 
     @property

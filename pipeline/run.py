@@ -145,6 +145,12 @@ def run(capture: Path, work: Path, request: Request, given: Path | None = None) 
     with stages.stage("calibration"):
         rig = read_json(capture / "rig.json", NominalRigFile, CAPTURE_AGAIN).rig
         sensor = read_json(capture / "sensor.json", SensorFile, CAPTURE_AGAIN).sensor
+        if len(sensor.responsivity) != len(rig.lasers):
+            raise InputError(
+                "is of another number of lasers than rig.json", file=capture / "sensor.json", key="sensor.responsivity",
+                value=list(sensor.responsivity), allowed=f"{len(rig.lasers)} values, one for each laser",
+                remedy=CAPTURE_AGAIN,
+            )  # fmt: skip
         mesh = read_scan(capture / "scan.ply", CAPTURE_AGAIN)
         calibration, calibrated = calibrate(capture, rig, sensor, mesh, given)
         calibration.save(work / "calibration.json")

@@ -4,6 +4,8 @@ FOLDER/capture.toml   `CaptureDescription`: the nominal rig as in a scene, what 
 FOLDER/images.csv     one line a frame, with the columns COLUMNS; frames that differ in exposure_s alone are a bracket
 FOLDER/...            the frames: 16-bit grey PNG or TIFF, raw digital numbers, black level included
 
+Frames of a bracket that cannot be of one image - the same file, or not as bright as their exposures say - are refused.
+
 docs/lab.md has an example. Importing is repeatable: what is in the stream already is not read again.
 """
 
@@ -17,11 +19,11 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from hw.base.arrays import U16
 from hw.base.config import NearbyFile, Strict, as_table, load_toml
@@ -42,6 +44,9 @@ COLUMNS = ("file", "kind", "camera", "angle_deg", "u", "v", "laser_nm", "exposur
 EXPOSURE_SHARE = 0.01  # by which an exposure may miss its power of two: as much is the radiance off
 ANGLE_DEG = 0.01
 WAVELENGTH_NM = 1.0
+BRIGHT = 0.1  # of the range above the offset: pixels that show how two exposures go together
+UNLIKE = 0.25  # by which their light may differ from what the exposures say; the nearest wrong exposure is half of it
+OFFSET_DN = 2.0  # as far as an offset may be off
 
 
 class CaptureDescription(Strict):
@@ -52,6 +57,26 @@ class CaptureDescription(Strict):
     saturation_dn: Annotated[int, Field(ge=1, le=65535)]  # linear below this
     sensor: Annotated[Sensor, as_table(Sensor)]
     rig: RigConfig
+
+    @model_validator(mode="after")
+    def _fits_itself(self) -> Self:
+        sensor, lasers = self.sensor, len(self.rig.lasers)
+        if len(sensor.responsivity) != lasers:
+            raise ValueError(
+                f"sensor.responsivity has {len(sensor.responsivity)} of the {lasers} values that rig.lasers ask for: "
+                "give one for each laser"
+            )
+        if self.saturation_dn > sensor.saturation_dn:
+            raise ValueError(
+                f"saturation_dn = {self.saturation_dn} is beyond what sensor.bits = {sensor.bits} can hold (allowed: "
+                f"at most {sensor.saturation_dn})"
+            )
+        if sensor.offset_dn >= self.saturation_dn:
+            raise ValueError(
+                f"sensor.offset_dn = {sensor.offset_dn:g} is no less than saturation_dn = {self.saturation_dn}: "
+                "nothing is left for light"
+            )
+        return self
 
 
 @dataclass(frozen=True)
@@ -88,7 +113,8 @@ def import_capture(folder: Path, out: Path, progress: Callable[[int, int], None]
             address = plan.address(index)
             frames = brackets[_key(plan, address)]
             camera = described.rig.cameras[plan.camera_of(address.view)]
-            raw = bracket.merge(_pixels(table, frames, (camera.height, camera.width), bracket))
+            pixels = _pixels(table, frames, (camera.height, camera.width), bracket)
+            raw = bracket.merge(_agreeing(table, pixels, sensor, described.saturation_dn))
             stream.append(address, raw, _meta(plan, address, frames))
             if progress is not None:
                 progress(index + 1, len(plan))
@@ -101,6 +127,7 @@ def import_capture(folder: Path, out: Path, progress: Callable[[int, int], None]
 def _read_table(path: Path, described: CaptureDescription) -> dict[Key, list[Frame]]:
     """The frames of every image, by falling exposure."""
     brackets: dict[Key, list[Frame]] = {}
+    seen: dict[Path, int] = {}
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = csv.DictReader(file)
@@ -109,6 +136,9 @@ def _read_table(path: Path, described: CaptureDescription) -> dict[Key, list[Fra
                 raise InputError(f"has no column {missing[0]!r}", file=path, allowed=", ".join(COLUMNS))
             for row in rows:
                 key, frame = _row(path, rows.line_num, row, described)
+                if (other := seen.setdefault(frame.file, frame.line)) != frame.line:
+                    problem = f"lines {other} and {frame.line} name the same file"
+                    raise InputError(problem, file=path, key="file", value=row["file"], remedy="correct one of them")
                 brackets.setdefault(key, []).append(frame)
     except OSError as error:
         problem, remedy = f"cannot be read ({error.strerror})", "docs/lab.md has an example"
@@ -226,9 +256,38 @@ def _meta(plan: Plan, address: ImageAddress, frames: list[Frame]) -> ImageMeta:
 # ---- the frames
 
 
-def _pixels(table: Path, frames: list[Frame], shape: tuple[int, int], bracket: Bracket) -> Iterator[tuple[int, U16]]:
+def _pixels(table: Path, frames: list[Frame], shape: tuple[int, int], bracket: Bracket) -> Iterator[tuple[Frame, U16]]:
     for frame in frames:
-        yield frame.exponent, read_frame(frame.file, shape, bracket.full_scale_dn, f"line {frame.line} of {table}")
+        yield frame, read_frame(frame.file, shape, bracket.full_scale_dn, f"line {frame.line} of {table}")
+
+
+def _agreeing(
+    table: Path, frames: Iterator[tuple[Frame, U16]], sensor: Sensor, saturation_dn: int
+) -> Iterator[tuple[int, U16]]:
+    """Frames of one image, by falling exposure, as (exponent, pixels). Raises: InputError where one is not as bright as
+    the one before it lets expect from exposure and power.
+    """
+    before: tuple[Frame, U16] | None = None
+    for frame, pixels in frames:
+        if before is not None and not sensor.response:
+            longer, shown = before
+            ratio = 2.0 ** (longer.exponent - frame.exponent)
+            ratio *= frame.power_w / longer.power_w if longer.power_w else 1.0
+            charge = shown.astype(np.float64) - sensor.offset_dn
+            used = (charge > BRIGHT * (saturation_dn - sensor.offset_dn)) & (shown < saturation_dn)
+            expected = float(charge[used].sum()) * ratio
+            found = float(pixels[used].sum(dtype=np.float64)) - sensor.offset_dn * int(used.sum())
+            noise = np.sqrt(
+                expected / sensor.gain_e_per_dn + used.sum() * (sensor.read_noise_e / sensor.gain_e_per_dn) ** 2
+            )
+            if abs(found - expected) > UNLIKE * expected + OFFSET_DN * used.sum() + 5 * noise:
+                raise InputError(
+                    f"lines {longer.line} and {frame.line} cannot be exposures of one image: the second should have "
+                    f"{ratio:.3g} of the first's light and has {found / expected * ratio:.3g}",
+                    file=table, key="exposure_s", remedy="correct file, exposure_s or power_w, or leave the frame out",
+                )  # fmt: skip
+        before = frame, pixels
+        yield frame.exponent, pixels
 
 
 def read_frame(path: Path, shape: tuple[int, int], full_scale_dn: int, where: str) -> U16:

@@ -182,7 +182,20 @@ def picture(array: NDArray[np.generic], name: str = "frames/front-0--1--1-0.tif"
         (replace("images.csv", "spot,front", "spot,left"), "camera = 'left'.*front, back"),
         (replace("images.csv", "spot,", "dot,"), "kind = 'dot'.*silhouette, spot"),
         (replace("capture.toml", "scan.obj", "scan.ply"), "scan.*no such file"),
-        (replace("capture.toml", "bits = 12", "bits = 11"), "saturation_dn|beyond the sensor"),
+        (replace("capture.toml", "bits = 12", "bits = 11"), "saturation_dn = 4000 is beyond .*at most 2047"),
+        (replace("capture.toml", "bits = 12", "bits = 17"), "sensor.bits = 17.*<= 16"),
+        (
+            replace("capture.toml", "[1e12, 2e12]", "[1e12]"),
+            "sensor.responsivity has 1 of the 2 values",
+        ),
+        (replace("capture.toml", "[1e12, 2e12]", "[1e12, -2e12]"), r"sensor.responsivity\[1\] = -2000000000000.*> 0"),
+        (replace("capture.toml", "gain_e_per_dn = 8.0", "gain_e_per_dn = 0.0"), "sensor.gain_e_per_dn = 0.*> 0"),
+        (replace("capture.toml", "offset_dn = 64.0", "offset_dn = 4001.0"), "sensor.offset_dn = 4001 is no less than"),
+        (replace("capture.toml", "steps = 4", "steps = 0"), "sensor.steps = 0"),
+        (
+            replace("images.csv", "front-0-1000-0-1.png", "front-0-1000-0-0.tif"),
+            r"lines \d+ and \d+ name the same file",
+        ),
         (picture(np.zeros((HEIGHT, WIDTH), np.uint8)), "is not 16-bit grey"),
         (picture(np.zeros((HEIGHT, WIDTH + 1), np.uint16)), f"has {WIDTH + 1} x {HEIGHT} pixels.*{WIDTH} x {HEIGHT}"),
         (picture(np.full((HEIGHT, WIDTH), 4096, np.uint16)), "beyond the sensor's.*0 to 4095.*upper bits"),
@@ -235,9 +248,42 @@ def test_a_scan_as_stl(folder: Path, tmp_path: Path) -> None:
 
 def test_duplicate_frames_are_refused(folder: Path, tmp_path: Path) -> None:
     text = (folder / "images.csv").read_text()
-    (folder / "images.csv").write_text(text + text.splitlines()[1] + "\n")
+    first = text.splitlines()[1]
+    (folder / "images.csv").write_text(text + "frames/again.png" + first[first.index(",") :] + "\n")
     with pytest.raises(InputError, match=r"lines 2 and \d+ are the same image with the same exposure"):
         import_capture(folder, tmp_path / "ours")
+
+
+def copy(source: str, target: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / "frames" / target).write_bytes((folder / "frames" / source).read_bytes())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        copy("front-0-1000-0-0.tif", "front-0-1000-0-1.png"),  # the same exposure under two names
+        copy("front-0-1000-0-2.tif", "front-0-1000-0-1.png"),
+        copy("front-0--1--1-3.png", "front-0-1000-0-1.png"),  # an image of something else
+    ],
+)
+def test_frames_that_contradict_their_exposures_are_refused(
+    folder: Path, tmp_path: Path, change: Callable[[Path], None]
+) -> None:
+    """A longer exposure has as much more light as it is longer: frames that do not are not of one image."""
+    change(folder)
+    with pytest.raises(InputError, match=r"images.csv: exposure_s: lines \d+ and \d+ cannot be exposures of one image"):
+        import_capture(folder, tmp_path / "ours")
+
+
+def test_power_that_differs_within_a_bracket_is_no_contradiction(folder: Path, tmp_path: Path) -> None:
+    """Rationale: one frame of twice the power, and twice the light."""
+    exposed = rate(0, 0, 1000, 0)
+    Image.fromarray(pixels(2 * exposed, LONGEST / 2)).save(folder / "frames" / "front-0-1000-0-1.png")
+    lines = (folder / "images.csv").read_text().splitlines()
+    doubled = [line.replace("0.011,", "0.02,") if "front-0-1000-0-1." in line else line for line in lines]
+    assert doubled != lines
+    (folder / "images.csv").write_text("\n".join(doubled))
+    import_capture(folder, tmp_path / "ours")
 
 
 def test_the_commands(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
