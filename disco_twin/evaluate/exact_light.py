@@ -8,9 +8,10 @@ scores hold no noise.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
@@ -28,8 +29,12 @@ from pipeline.reconstruct.samples.spots import Spots
 from pipeline.relight.irradiance import hat_moments
 from pipeline.relight.lights import Light
 
+if TYPE_CHECKING:
+    from disco_twin.light.sources import Source
+
 SAMPLE_WALKS, REPLICATES = 30_000, 4  # of a spot's exact samples; those whose spread is their noise
-SPOTS_AT_ONCE = 25
+SPOTS_AT_ONCE = 5
+PHOTONS_AT_ONCE = 1 << 18  # about a second: Ctrl-C is obeyed, and progress reported, between two calls of the renderer
 NEGLIGIBLE = 1e-6  # of a pattern's power
 
 
@@ -43,10 +48,14 @@ class _Pattern:
 
 
 class ExactLight:
-    """The object's light by photons. eta: the index that the ends assume; walks: photons of a light, both halves."""
+    """The object's light by photons. eta: the index that the ends assume; walks: photons of a light, both halves.
+
+    walked: is told the number of photons that have been walked since it was told last
+    """
 
     def __init__(self, experiment: Experiment, eta: float, walks: int) -> None:
         self.experiment, self.eta, self.walks = experiment, eta, walks
+        self.walked: Callable[[int], None] = lambda photons: None
         self.mesh, self.scan = experiment.object.mesh, experiment.scan
         self.mean = mean_transmittance(eta)
         self.areas = RayMesh.of(self.mesh).vertex_areas
@@ -57,12 +66,30 @@ class ExactLight:
         transport = self.experiment.transport  # starts the renderer, which the next module imports
         from disco_twin.light.sources import light_source
 
-        traced = transport.trace(
-            lambda group: light_source(light, transport.radius, group), 2, max(1, self.walks // 2),
-            seed=self.experiment.seed(f"budget {light.name}"), deposit=True,
-        )  # fmt: skip
-        assert traced.deposits is not None
-        return traced.deposits
+        _, power = self._trace(lambda group: light_source(light, transport.radius, group), 2, light.name)
+        return power
+
+    def _trace(
+        self, source: Callable[[Sequence[int]], Source], tags: int, name: str, cameras: Sequence[PinholeCamera] = ()
+    ) -> tuple[F64 | None, F64]:
+        """(T, C, L, H, W) radiance from below the surface per W in the cameras, and (T, L, V_fine) power that leaves:
+        means over `walks` photons of all T tags together, some at a time.
+        """
+        walks, images, power = max(1, self.walks // tags), None, np.zeros(())
+        step = max(1, PHOTONS_AT_ONCE // tags)
+        for first in range(0, walks, step):
+            count = min(step, walks - first)
+            traced = self.experiment.transport.trace(
+                source, tags, count, seed=self.experiment.seed(f"budget {name}"), cameras=cameras, deposit=True,
+                layers=2 if cameras else 1, first=first,
+            )  # fmt: skip
+            assert traced.deposits is not None
+            power = power + traced.deposits * (count / walks)
+            if traced.images is not None:
+                below = traced.images[:, 0].astype(np.float64) * (count / walks)
+                images = below if images is None else images + below
+            self.walked(count * tags)
+        return images, power
 
     def entering(self, light: Light) -> F64:
         """(L, V_fine) W/mm^2 whose transmitted share is the light's, if it came from all around: a diffuse entry."""
@@ -91,18 +118,14 @@ class ExactLight:
         if not patterns:  # black light
             return images, power
         hats = np.stack([pattern.hat for pattern in patterns] * 2)  # the first half's, then the second's
-        traced = transport.trace(
-            lambda group: HatSource(transport.vertices, transport.faces, hats, len(group)), len(hats),
-            max(1, self.walks // len(hats)), seed=self.experiment.seed(f"budget {name}"), cameras=cameras, layers=2,
-            deposit=True,
-        )  # fmt: skip
-        assert traced.deposits is not None
+        seen, left = self._trace(
+            lambda group: HatSource(transport.vertices, transport.faces, hats, len(group)), len(hats), name, cameras
+        )
         for tag in range(len(hats)):
             half, pattern = tag // len(patterns), patterns[tag % len(patterns)]
-            power[half, pattern.lasers] += pattern.watts[:, None] * traced.deposits[tag, pattern.lasers]
-            if images is not None and traced.images is not None:
-                below = traced.images[tag, 0][:, pattern.lasers]  # the layer from below the surface
-                images[half][:, pattern.lasers] += pattern.watts[:, None, None] * below
+            power[half, pattern.lasers] += pattern.watts[:, None] * left[tag, pattern.lasers]
+            if images is not None and seen is not None:
+                images[half][:, pattern.lasers] += pattern.watts[:, None, None] * seen[tag][:, pattern.lasers]
         return images, power
 
     def spot_responses(self, spots: Spots) -> tuple[F64, F64]:
@@ -134,6 +157,7 @@ class ExactLight:
             r = power.reshape(len(some), REPLICATES, lasers, -1) / (area * self.mean**2)
             value[:, some] = np.moveaxis(r.mean(axis=1), 1, 0)
             variance[:, some] = np.moveaxis(r.var(axis=1, ddof=1), 1, 0) / REPLICATES
+            self.walked(len(some) * SAMPLE_WALKS)
         return value, variance
 
     # ---- the diffuse exit: B = exitance / Tbar, seen by F_t / pi

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,10 +69,14 @@ def test_a_budget_is_continued_kept_and_made_again_where_it_depends_on_what_chan
     def stop(*_: Any) -> Any:
         raise KeyboardInterrupt
 
+    screen = Console(file=io.StringIO(), width=100)
     with monkeypatch.context() as once:
         once.setattr(JobRows, "exact_samples", stop)
         with pytest.raises(Interrupted, match="stopped during budget; the same command continues"):
-            make_budget(frozen, WALKS)
+            make_budget(replace(frozen, console=screen), WALKS)
+    lines = [line.split() for line in screen.file.getvalue().splitlines()]
+    assert [line[:2] for line in lines] == [["1/6", "entry"], ["2/6", "ends"], ["3/6", "hats"]]
+    assert all(float(line[2]) > 0 and line[3] == "s" for line in lines)
     assert groups(frozen) == {"entry", "ends", "hats"}
 
     light = ("exact_entry", "diffuse_ends", "true_model")

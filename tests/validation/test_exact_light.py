@@ -12,7 +12,7 @@ from disco_twin.evaluate import exact_light
 from disco_twin.evaluate.exact_light import ExactLight, best_curve
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.light.truth import truth_columns
-from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.camera import PinholeCamera, look_at
 from pipeline.geometry.fresnel import Boundary
 from pipeline.reconstruct.global_term.boundary_fit import SeenRadiosity
 from pipeline.reconstruct.samples.spots import Spots
@@ -50,6 +50,22 @@ def test_under_uniform_light_a_diffuse_entry_is_exact(exact: ExactLight) -> None
     assert_z(z_of_difference(on_hats(exact, afar), on_hats(exact, near)), "diffuse entry under uniform light")
     brighter = on_hats(exact, [1.03 * p for p in near]).sum(axis=1)
     assert abs(z_of_difference(on_hats(exact, afar).sum(axis=1), brighter)) > 5  # the test can fail
+
+
+def test_light_in_parts_is_that_of_the_whole(exact: ExactLight, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rationale: between two parts Ctrl-C is obeyed, and progress reported. Expected: the same photons, none twice; no
+    part is larger than was asked for.
+    """
+    camera = PinholeCamera(24, 24, np.full(2, 150.0), np.full(2, 12.0), np.zeros(5), look_at((200.0, 0, 0), (0, 0, 0)))
+    density, told = exact.entering(Uniform()), list[int]()
+    whole = exact.power_of(Uniform()), *exact.after_diffuse_entry("parts", density, [camera])
+    monkeypatch.setattr(exact_light, "PHOTONS_AT_ONCE", 3000)
+    monkeypatch.setattr(exact, "walked", told.append)
+    parts = exact.power_of(Uniform()), *exact.after_diffuse_entry("parts", density, [camera])
+    for one, other in zip(whole, parts, strict=True):
+        assert one is not None and other is not None
+        np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-6 * float(one.max()))
+    assert sum(told) == 2 * WALKS and max(told) <= 3000
 
 
 def test_negative_parts_of_a_density_are_taken_away(exact: ExactLight) -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from disco_twin.evaluate.exact_light import ExactLight, best_curve
 from disco_twin.evaluate.scores import reference_halves
 from disco_twin.run.budget.rows import CONSISTENT, EXACT_ENTRY, EXACT_EXIT, FLOOR, LUMPED, SMOOTH, TRUE_MODEL, Images
+from disco_twin.run.progress import Report
 from disco_twin.run.stages import Run
 from hw.base.arrays import F64
 from pipeline.geometry.camera import PinholeCamera
@@ -36,6 +37,18 @@ class LightRows:
     def exact(self) -> ExactLight:
         """The object's light."""
         return ExactLight(self.run.experiment, self.smooth.eta, self.walks)
+
+    def count(self, report: Report, photons: int) -> None:
+        """Report photons from now on, of so many."""
+        done = 0
+
+        def walked(more: int) -> None:
+            nonlocal done
+            done += more
+            report(min(done, photons), photons)
+
+        self.exact.walked = walked
+        report(0, photons)
 
     def exact_entry(self) -> dict[str, Images]:
         """Light enters as it does, and leaves diffusely: on the fine mesh, and averaged over the scan's hats."""

@@ -1,16 +1,19 @@
 """Makes the rows of an error budget that are not there yet, and keeps them in OUT/twin/budget.json.
 
-Rows that share their photons or their pipeline are made together, as a group; what is finished is not made again.
+Rows that share their photons or their pipeline are made together, as a group; what is finished is not made again. Each
+group shows a bar while it is made, and a line when it is there.
 """
 
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
+from disco_twin.evaluate.exact_light import SAMPLE_WALKS
 from disco_twin.evaluate.scores import reference_halves
 from disco_twin.evaluate.true_calibration import VARIANTS
 from disco_twin.experiment.pipeline_process import stale
@@ -18,7 +21,7 @@ from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.run.budget.job_rows import JobRows
 from disco_twin.run.budget.light_rows import LightRows
 from disco_twin.run.budget.rows import EXACT_SCAN, NOMINAL, QUIET, Budget, BudgetRow, Images
-from disco_twin.run.progress import stage_bar
+from disco_twin.run.progress import Report, stage_bar
 from disco_twin.run.stages import Run
 from hw.base.config import Strict, read_json
 from hw.base.errors import InputError
@@ -63,11 +66,11 @@ class _Record(Strict):
 class _Group:
     """Rows that are made together. inputs: what they depend on beside object, rig, references and code.
 
-    make: the floor's curve -> the rows, and a new curve of the floor where they have one
+    make: the floor's curve -> the rows, and a new curve of the floor where they have one; it reports its photons
     """
 
     inputs: tuple[Any, ...]
-    make: Callable[[Boundary], tuple[Mapping[str, Images], Boundary | None]]
+    make: Callable[[Boundary, Report], tuple[Mapping[str, Images], Boundary | None]]
 
 
 def make_budget(run: Run, walks: int = WALKS) -> Budget:
@@ -83,18 +86,18 @@ def make_budget(run: Run, walks: int = WALKS) -> Budget:
         kept = _kept_groups(run.folder)
         references = run.folder.stages["references"].key
         try:
-            with stage_bar(run.console, "budget", "parts") as report:
-                for number, (name, group) in enumerate(groups.items()):
-                    report(number, len(groups))
-                    key = run.key("budget", references, *group.inputs)
-                    if name in kept and kept[name].key == key:
-                        continue
+            for number, (name, group) in enumerate(groups.items(), 1):
+                key, start = run.key("budget", references, *group.inputs), time.perf_counter()
+                note = "made before"
+                if name not in kept or kept[name].key != key:
                     curve = kept[ENDS].curve if ENDS in kept else None
-                    rows, found = group.make(_boundary(run, curve))
+                    with stage_bar(run.console, name, "photons") as report:
+                        rows, found = group.make(_boundary(run, curve), report)
                     kept[name] = _Kept(key=key, rows=_scored(run, rows), curve=_written(found))
                     record = {"format_version": FORMAT_VERSION, "groups": {k: g.model_dump() for k, g in kept.items()}}
                     write_json(run.folder.twin / RECORD, record)
-                report(len(groups), len(groups))
+                    note = f"{time.perf_counter() - start:.1f} s"
+                run.console.print(f"  {f'{number}/{len(groups)} {name}':<32} {note:>12}", highlight=False)
         except KeyboardInterrupt:
             raise Interrupted("stopped during budget; the same command continues") from None
     return Budget(tuple(row for name in groups for row in kept[name].rows), left_out)
@@ -119,14 +122,25 @@ def _groups(run: Run, walks: int) -> tuple[dict[str, _Group], dict[str, str]]:
     lit = (walks, run.scene.reconstruct.eta, run.scene.relight.model_dump(mode="json"))
     job = (run.folder.stages["pipeline"].key, run.methods[0])
 
+    def of_light(work: Callable[[Boundary], tuple[Mapping[str, Images], Boundary | None]]) -> _Group:
+        def counted(curve: Boundary, report: Report) -> tuple[Mapping[str, Images], Boundary | None]:
+            light.count(report, walks * len(run.scene.relight.lights))
+            return work(curve)
+
+        return _Group(lit, counted)
+
+    def of_samples(curve: Boundary, report: Report) -> tuple[Mapping[str, Images], None]:
+        light.count(report, SAMPLE_WALKS * len(run.experiment.plan.spots))
+        return jobs.exact_samples(light.exact, curve), None
+
     def of_job(work: Callable[[], Mapping[str, Images]]) -> _Group:
-        return _Group(job, lambda _: (work(), None))
+        return _Group(job, lambda curve, report: (work(), None))
 
     groups = {
-        "entry": _Group(lit, lambda _: (light.exact_entry(), None)),
-        ENDS: _Group(lit, lambda _: light.diffuse_ends()),
-        "hats": _Group(lit, lambda curve: (light.true_model(curve), None)),
-        "samples": _Group((*lit, *job), lambda curve: (jobs.exact_samples(light.exact, curve), None)),
+        "entry": of_light(lambda _: (light.exact_entry(), None)),
+        ENDS: of_light(lambda _: light.diffuse_ends()),
+        "hats": of_light(lambda curve: (light.true_model(curve), None)),
+        "samples": _Group((*lit, *job), of_samples),
         "measured": of_job(jobs.measured),
     }
     left_out: dict[str, str] = {}
