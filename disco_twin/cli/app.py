@@ -54,7 +54,7 @@ def run(
         opened = begin_run(scene, out, profile, methods, console, faults)
         console.print(f"[bold]{opened.scene.name}[/bold] into {out}", highlight=False)
         summary = run_all(opened)
-    console.print("", score_table(summary, opened.methods), sep="\n")
+    console.print("", score_table(summary), sep="\n")
     console.print(f"\nreport: {opened.folder.report_file.resolve()}", soft_wrap=True, highlight=False)
 
 
@@ -173,7 +173,7 @@ def score(out: RunOut, methods: MethodsOption = None) -> None:
 
     opened = reopen_run(out, methods, console)
     with naming(opened.scene_file), run_log(opened.folder.root / "run.log", console):
-        console.print("", score_table(score_stages(opened), opened.methods), sep="\n")
+        console.print("", score_table(score_stages(opened)), sep="\n")
 
 
 @app.command()

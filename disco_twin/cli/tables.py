@@ -17,9 +17,10 @@ if TYPE_CHECKING:
 QUALITY = ("view", "camera", "deg", "images", "saturated", "lit", "range", "dark", "mW")
 
 
-def score_table(summary: dict[str, Any], methods: Sequence[str]) -> Table:
-    """nrmse by light and method."""
+def score_table(summary: dict[str, Any]) -> Table:
+    """nrmse by light and method, the one under test first."""
     relit = summary["relit"]
+    methods = list(dict.fromkeys(row["method"] for row in relit))
     table = _table(("nrmse", *methods), "nrmse")
     for light in dict.fromkeys(r["light"] for r in relit):
         table.add_row(light, *(figure_or_dash(pooled(relit, method, light)) for method in methods))

@@ -35,16 +35,17 @@ def pipeline_inputs(scene: Scene, methods: Sequence[str]) -> dict[str, Any]:
 
 
 def reconstruct_apart(
-    scene: Scene, folder: RunFolder, methods: Sequence[str], calibration: Path | None = None
+    scene: Scene, folder: RunFolder, methods: Sequence[str], calibration: Path | None = None, kept: Sequence[str] = ()
 ) -> float:
     """Run `python -m pipeline` on the capture; its peak memory in MiB. Its messages go to OUT/work/pipeline.log.
 
-    calibration: a file to use instead of what the pipeline would calibrate itself.
+    calibration: a file to use instead of what the pipeline would calibrate itself; kept: methods of the latest record
+    that stay in it, since their models still hold.
     The process reports its peak itself: `wait4` would count what our process held when it started the child.
 
     Raises: PipelineFailed with the process's own last line.
     """
-    request = folder.work / REQUEST
+    request, before = folder.work / REQUEST, _record(folder) if kept else {}
     write_json(request, pipeline_inputs(scene, methods))
     command = [sys.executable, "-m", "pipeline", str(folder.capture), str(folder.work), "--request", str(request)]
     command += ["--until-stdin-closes", *(() if calibration is None else ("--calibration", str(calibration)))]
@@ -66,7 +67,25 @@ def reconstruct_apart(
             remedy = "a scan of fewer vertices (scan.vertices), fewer methods, or a machine with more memory"
             raise PipelineFailed(f"{folder.capture}: the pipeline was killed, most likely for memory. Remedy: {remedy}")
         raise PipelineFailed(why if status == 2 else f"the pipeline failed: {why} (see {folder.work / 'pipeline.log'})")
+    if kept:
+        _keep(scene, folder, before, kept)
     return max(row.peak_mb for row in load_results(folder).stages)
+
+
+def _record(folder: RunFolder) -> dict[str, Any]:
+    """pipeline.json as it stands."""
+    return read_json(folder.work / "pipeline.json", dict[str, Any], f"disco-twin reconstruct --out {folder.root}")
+
+
+def _keep(scene: Scene, folder: RunFolder, before: dict[str, Any], kept: Sequence[str]) -> None:
+    """Write the record, and the request, of what was made now and of the methods that stay from before."""
+    now = _record(folder)
+    own = {method: before["methods"][method] for method in kept}
+    theirs = [row for row in before["left_out"] if any(row["what"].endswith(f" of {method}") for method in kept)]
+    now["left_out"] += [row for row in theirs if row not in now["left_out"]]
+    now["methods"] = own | now["methods"]
+    write_json(folder.work / "pipeline.json", now)
+    write_json(folder.work / REQUEST, pipeline_inputs(scene, tuple(now["methods"])))
 
 
 def load_results(folder: RunFolder) -> PipelineRecord:

@@ -205,19 +205,34 @@ def pipeline_key(run: Run, methods: Sequence[str]) -> str:
     return run.key("pipeline", capture, pipeline_inputs(run.scene, methods))
 
 
+def still_made(run: Run) -> tuple[str, ...]:
+    """Methods whose models the latest reconstruct left, if it was of the capture, the code and the settings of now."""
+    record = run.folder.stages.get("pipeline")
+    if record is None or not record.finished or not (run.folder.work / "pipeline.json").is_file():
+        return ()
+    made = tuple(load_results(run.folder).methods)
+    return made if record.key == pipeline_key(run, made) else ()
+
+
 def pipeline_stage(run: Run) -> None:
     """Reconstruct and relight, in a process of its own that is given the capture and nothing of the truth.
 
+    Methods that were made before of this capture, by this code and these settings, stay.
+
     Raises: PipelineFailed with its last line, and what `Run.stage` raises.
     """
-    key = pipeline_key(run, run.methods)
-    run.stage("pipeline", key, lambda _: reconstruct_apart(run.scene, run.folder, run.methods))
+    made = still_made(run)
+    kept = made if made and run.folder.stages["pipeline"].damaged(run.folder.root) is None else ()
+    methods = tuple(dict.fromkeys([*made, *run.methods]))
+    asked = [method for method in methods if method not in kept]
+    key = pipeline_key(run, methods)
+    run.stage("pipeline", key, lambda _: reconstruct_apart(run.scene, run.folder, asked, kept=kept))
     for warning in load_results(run.folder).warnings:
         log.warning("%s", warning)
 
 
 def score_stages(run: Run) -> dict[str, Any]:
-    """Scores, summary.json and report.html; the summary.
+    """Scores, summary.json and report.html of all methods that were made, the run's own first; the summary.
 
     Raises: InputError where a stage before is not finished, or the reconstruction is of other settings.
     """
@@ -242,9 +257,10 @@ def score_stages(run: Run) -> dict[str, Any]:
     if done["truth"].key != run.key("truth"):
         log.warning("the code of the ground truth has changed since it was computed; `%s` computes it again", again)
     neck = run.scene.relight.model_dump_json(include={"neck"})
-    key = run.key("scores", *(done[name].key for name in ("truth", "references", "pipeline")), list(run.methods), neck)
-    run.stage("scores", key, lambda _: score_run(run.experiment, run.folder, run.methods))
     made = load_results(run.folder)
+    methods = list(dict.fromkeys([*run.methods, *made.methods]))
+    key = run.key("scores", *(done[name].key for name in ("truth", "references", "pipeline")), methods, neck)
+    run.stage("scores", key, lambda _: score_run(run.experiment, run.folder, methods))
     left_out = [*left_out_by_the_twin(run.experiment), *made.left_out]
     stages, scores = stage_rows(run.folder, made.stages), load_scores(run.folder)
     summary = make_summary(run.scene, run.folder, run.methods[0], stages, scores, made.calibration, left_out)

@@ -54,7 +54,7 @@ def test_the_report_and_the_table_show_a_dash_where_there_is_no_score() -> None:
     page = render(replace(data, summary={**data.summary, "relit": [r | dict.fromkeys(KEPT) for r in rows]}))
     assert "<b>-</b><span>nrmse under broad light" in page
     out = StringIO()
-    Console(file=out, width=200).print(score_table({"relit": rows}, list(METHODS)))
+    Console(file=out, width=200).print(score_table({"relit": rows}))
     lines = {line.split()[0]: line.split()[1:] for line in out.getvalue().splitlines() if line.strip()}
     assert lines["edge"] == ["-"] * len(METHODS)
     assert all(float(x) > 0 for x in lines["spot"])
