@@ -25,8 +25,9 @@ MOST_SPOTS = 100
 FEWEST = 500  # samples beyond NEAREST
 ALIKE = 20.0  # samples next to each other err together: so many tell as much as one
 START, SPREAD = (0.2, 5e-3), (1.5, 3.0)  # D and sigma_a in edges and per edge; by what their logarithms may differ
+STEEPEST = 0.5  # fall over an edge: linear elements are then off by a hundredth of it, a tenth over ten edges' worth
 DARKEST = 1e-12  # of the largest fluence rate: what is below are rounding errors
-STEPS, ENOUGH, LONGEST = 12, 0.02, 1.5  # of the logarithms
+STEPS, ENOUGH, LONGEST = 12, 0.01, 1.5  # of the logarithms
 
 
 class NoMedium(Exception):
@@ -69,14 +70,20 @@ def fit_medium(
             bright = seen & (measured.value > 0)
             x = np.array([*x[:2], np.median(np.log(measured.value[bright] / mean[bright])) if bright.any() else 0.0])
         relative, weight = measured.residual(mean * np.exp(x[2]))
-        slopes = [at_vertices[1][seen] / mean[seen], at_vertices[2][seen] / mean[seen], np.ones(count)]
-        jacobian = np.stack(slopes, axis=1)
+        weight = np.where(at_vertices[0] > mean.min(), weight, 0.0)  # what elements are too coarse for tells nothing
+        slopes = np.where(weight > 0, at_vertices[1:] / mean, 0.0)
+        jacobian = np.stack([slopes[0][seen], slopes[1][seen], np.ones(count)], axis=1)
         move = Linearised(x, -relative[seen], jacobian, weight[seen] / ALIKE, prior).step()
         x = x + move * min(1.0, LONGEST / np.abs(move).max())
-        if np.abs(move).max() < ENOUGH:
+        # By what it does to the samples: where nothing absorbs, sigma_a itself is open.
+        if np.sqrt(np.average((jacobian @ move) ** 2, weights=weight[seen])) < ENOUGH:
             log.info("medium: D %.3g mm, sigma_a %.2g/mm after %d steps", *np.exp(x[:2]), step + 1)
-            return HomogeneousMedium(*np.exp(x).tolist())
-    raise NoMedium(f"the fit of D and sigma_a had not converged after {STEPS} steps")
+            break
+    else:
+        raise NoMedium(f"the fit of D and sigma_a had not converged after {STEPS} steps")
+    if (fall := float(np.exp(0.5 * (x[1] - x[0]))) * samples.edge) > STEEPEST:
+        raise NoMedium(f"light falls by exp(-{fall:.2f}) over an edge of the scan, which elements follow to {STEEPEST}")
+    return HomogeneousMedium(*np.exp(x).tolist())
 
 
 def _solver(diffusion: Diffusion, x: F64) -> Solver:

@@ -226,6 +226,34 @@ def test_too_few_samples_show_no_medium(diffuse: Synthetic) -> None:
     assert medium_priors(few)[2].endswith("are needed")
 
 
+def test_light_that_falls_too_steeply_for_the_elements_is_left_to_distance() -> None:
+    """Rationale: R_d of exp(-.7 d / edge) / d^2 or so; elements of an edge cannot follow it."""
+    base = make(subdivisions=3, spots=60, contrast=0.0)
+    samples = base.samples
+    exact = samples.spot_pairs.mean(lambda d: np.exp(-0.9 * d / samples.edge) / (1 + (d / samples.edge) ** 2))[None]
+    values = np.where(np.isfinite(samples.values), exact, np.nan).astype(np.float32)
+    steep = samples.with_readings(values=values, noise_per_signal=(1e-4 * np.nan_to_num(values)).astype(np.float32))
+    with pytest.raises(NoMedium, match="over an edge of the scan"):
+        fit_medium(steep, 0, Diffusion.of(samples.mesh, ETA))
+
+
+def test_without_absorption_the_fit_ends() -> None:
+    """Rationale: sigma_a is then open downwards; the fit ends when the samples' expectations do not move any more."""
+    base = make(subdivisions=3, spots=60, contrast=0.0)
+    samples = base.samples
+
+    def r_d(distance: F64) -> F64:
+        return 0.2 * sphere_fluence(np.clip(1 - 0.5 * (distance / RADIUS) ** 2, -1, 1), absorption=1e-7)
+
+    values = np.where(np.isfinite(samples.values), samples.spot_pairs.mean(r_d)[None], np.nan).astype(np.float32)
+    clear = samples.with_readings(values=values, noise_per_signal=(1e-4 * np.nan_to_num(values)).astype(np.float32))
+    elements = Diffusion.of(samples.mesh, ETA)
+    found = fit_medium(clear, 0, elements)
+    far = samples.vertex_pairs.distance > NEAREST * samples.edge
+    light = found.level * elements.between(found.diffusivity, found.absorption)[far]
+    assert np.log(light / r_d(samples.vertex_pairs.distance[far])).std() < LEAST_FAR / 2
+
+
 @pytest.mark.parametrize("scatter", [0.25, 0.45])
 def test_the_scatter_far_from_spots_is_that_of_the_object(diffuse: Synthetic, scatter: float) -> None:
     """Rationale: known log-normal deviations from the profile. FAR where noise hides all."""
