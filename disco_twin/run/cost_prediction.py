@@ -103,10 +103,11 @@ def predict(experiment: Experiment, shipped: Path) -> list[tuple[str, str]]:
             "noise",
             f"of the simulation {spot.median:.3g} times the camera's in the median pixel, in the time of "
             f"{spot.time_walks} plain walks a spot ({spot.seconds:.2g} s of a core); half of it takes four times as "
-            f"long, {needed:.1e} plain walks bring it below the camera's in every pixel (all within a factor of three)",
+            f"long, {needed:.1e} plain walks bring it below the camera's in every pixel",
         )
     )
     by_decade = ", ".join(f"{decade}: {ratio:.3g}" for decade, ratio in spot.by_decade.items())
-    lines.append(("", f"by decade below a spot's peak {by_decade}"))
+    sure = "to decade -3 within a factor of three, the median within five; fainter ones are taken for too noisy"
+    lines.append(("", f"by decade below a spot's peak {by_decade} ({sure})"))
     lines += [("left out", f"{item['what']}: {item['because']}") for item in left_out_by_the_twin(experiment)]
     return lines
