@@ -18,6 +18,7 @@ from pipeline.geometry.directions import cosine_directions
 
 CREASE = np.cos(np.deg2rad(30.0))  # between a vertex's normal and a triangle's
 EXCHANGE_DIRECTIONS = 64  # from each of a triangle's three points
+LEAST_OPEN = 1e-3  # of an area: rays that stand for others may meet the mesh a little more often than all
 _OFFSET = 1e-5  # of the mesh's size: shadow rays start this far above the face, far beyond embree's float32
 
 
@@ -151,12 +152,12 @@ class RayMesh:
             total = total + leaves.T @ (arrives * np.repeat(share, EXCHANGE_DIRECTIONS)[rays, None])
         return sparse.csr_array(0.5 * (total + total.T))
 
-    @cached_property
-    def open_areas(self) -> F64:
-        """(V,) integral of each vertex's hat function in mm^2, times the share of light leaving it diffusely that meets
-        the mesh nowhere else: the vertex areas on a convex mesh.
+    def open_areas(self, entering: float) -> F64:
+        """(V,) integral of each vertex's hat function in mm^2, times the share of light leaving it diffusely that goes
+        for good, where a share `entering` of what meets the mesh again enters it: the vertex areas on a convex mesh.
         """
-        return np.asarray(self.vertex_areas - self.exchange.sum(axis=1))
+        left = self.vertex_areas - entering * np.asarray(self.exchange.sum(axis=1))
+        return np.asarray(np.maximum(left, LEAST_OPEN * self.vertex_areas))
 
     @cached_property
     def mass_matrix(self) -> sparse.csc_array:

@@ -245,7 +245,8 @@ def complete(samples: Samples) -> RelightableModel:
 
     measured_ratio = measure_boundary(samples.mesh, samples.eta, samples.glow, expected)
     boundary = of_mean_one(measured_ratio, samples, np.stack([fit.at_spots for fit in fits]))
-    leaves, level = RayMesh.of(samples.mesh).open_areas, boundary.mean_transmittance**2
+    leaves = RayMesh.of(samples.mesh).open_areas(boundary.mean_transmittance)
+    level = boundary.mean_transmittance**2
     expected_totals = np.stack([medium.totals for medium in media]) if media else None
     reflectance = steady_totals(reflectance, relative, leaves, level, basis, edge, expected_totals)
     variance = (reflectance**2 * (relative + BOTH_ENDS)).astype(np.float32)

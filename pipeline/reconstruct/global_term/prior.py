@@ -12,7 +12,8 @@ import numpy as np
 from hw.base.arrays import F64
 from pipeline.reconstruct.global_term.radial_profile import fit_profile
 from pipeline.reconstruct.medium.diffusion import Diffusion
-from pipeline.reconstruct.medium.medium_fit import HomogeneousMedium, MediumPrior, NoMedium, fit_medium
+from pipeline.reconstruct.medium.medium_fit import HomogeneousMedium, MediumPrior, fit_medium
+from pipeline.reconstruct.medium.tetrahedra import NoMedium
 from pipeline.reconstruct.samples.laser_samples import LaserSamples
 from pipeline.reconstruct.samples.samples import Samples
 
@@ -49,16 +50,12 @@ def far_scatter(samples: Samples, laser: int, at_spots: F64 | float) -> float:
     return float(np.sqrt(max(scatter**2 - noise[clear].mean(), 0.0)))
 
 
-def _credited(scatter: float) -> float:
-    return float(np.clip(scatter, LEAST_FAR, FAR))
-
-
 def medium_priors(samples: Samples) -> tuple[list[MediumPrior], float, str]:
     """One for each laser, none where a medium does not help; what `deviation` comes to far from a spot (the scatter of
     the middle wavelength, which stands for all, in bounds); and why there is none.
     """
     middle = len(samples.values) // 2
-    alone = far_scatter(samples, middle, 0.0)
+    alone = _credited(far_scatter(samples, middle, 0.0), np.inf)
     try:
         diffusion, found = Diffusion.of(samples.mesh, samples.eta), list[HomogeneousMedium]()
         for laser in range(len(samples.values)):
@@ -66,9 +63,14 @@ def medium_priors(samples: Samples) -> tuple[list[MediumPrior], float, str]:
     except NoMedium as why:
         return [], _credited(alone), str(why)
     prior = MediumPrior.of(samples, diffusion, found[middle])
-    far = far_scatter(samples, middle, prior.at_spots)
+    far = _credited(far_scatter(samples, middle, prior.at_spots), np.inf)
     log.info("log R_d scatters by %.3f about distance alone, by %.3f about a homogeneous medium", alone, far)
-    if far > WORTH * alone:
+    if not far < WORTH * alone:
         because = f"log R_d scatters by {far:.2f} about a homogeneous one, by {alone:.2f} about distance alone"
         return [], _credited(alone), because
-    return [MediumPrior.of(samples, diffusion, medium) for medium in found], _credited(far), ""
+    others = {k: MediumPrior.of(samples, diffusion, m) for k, m in enumerate(found) if k != middle}
+    return [others.get(k, prior) for k in range(len(found))], _credited(far), ""
+
+
+def _credited(scatter: float, most: float = FAR) -> float:
+    return float(np.clip(scatter, LEAST_FAR, most))

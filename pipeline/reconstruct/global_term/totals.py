@@ -43,10 +43,25 @@ class Kriging:
     shared: F64
     noise: F64
 
-    def posterior(self, observed: F64) -> tuple[F64, F64, float]:
+    def posterior(self, observed: F64) -> tuple[F64, F64]:
         """(V,) mean and variance of z given the observations (Rasmussen & Williams 2006, eq. 2.25, 2.26; its mean by
-        generalised least squares), and the logarithm of their likelihood, but for a constant.
+        generalised least squares).
         """
+        both, (factor, level, pull, _) = self.spectrum + self.shared, self._solved(observed)
+        mean = level + self.functions @ (self.spectrum * (self.functions.T @ pull))
+        # Of a + b the observations leave the inverse of what was factored; a is its share of that, and what b hides.
+        part = self.functions * (self.spectrum / both)
+        variance = (part * cho_solve(factor, part.T).T).sum(axis=1)
+        variance += (self.functions**2 * (self.spectrum * self.shared / both)).sum(axis=1)
+        return np.asarray(mean), np.asarray(variance)
+
+    def likelihood(self, observed: F64) -> float:
+        """Logarithm of that of the observations, but for a constant."""
+        _, level, pull, size = self._solved(observed)
+        return float(-0.5 * ((observed - level) @ pull + size))
+
+    def _solved(self, observed: F64) -> tuple[tuple[F64, bool], float, F64, float]:
+        """The factored precision of a + b; the level; (V,) inverse covariance times the rest; and log determinant."""
         weighted, both = self.functions / self.noise[:, None], self.spectrum + self.shared
         factor = cho_factor(self.functions.T @ weighted + np.diag(1.0 / both))
 
@@ -55,14 +70,8 @@ class Kriging:
 
         one = np.ones(len(observed))
         level = float((whitened(one) @ observed) / (whitened(one) @ one))
-        pull = whitened(observed - level)
-        mean = level + self.functions @ (self.spectrum * (self.functions.T @ pull))
-        # Of a + b the observations leave the inverse of what was factored; a is its share of that, and what b hides.
-        part = self.functions * (self.spectrum / both)
-        variance = (part * cho_solve(factor, part.T).T).sum(axis=1)
-        variance += (self.functions**2 * (self.spectrum * self.shared / both)).sum(axis=1)
         size = 2 * np.log(np.diag(factor[0])).sum() + np.log(both).sum() + np.log(self.noise).sum()
-        return np.asarray(mean), np.asarray(variance), float(-0.5 * ((observed - level) @ pull + size))
+        return factor, level, whitened(observed - level), float(size)
 
 
 def steady_totals(
@@ -89,19 +98,18 @@ def steady_totals(
     known = np.log(total * exitance_per_flux) - shape
     shared = _spectrum(basis, SHARED_RANGE * edge, size)
 
-    def field(laser: int, choice: tuple[float, float, float]) -> tuple[F64, F64, float]:
+    def field(laser: int, choice: tuple[float, float, float]) -> Kriging:
         length, deviation, common = choice
         own = _spectrum(basis, length * edge, deviation)
-        noise = open_deviation[laser] ** 2 + common**2
-        return Kriging(basis.functions, own, shared, noise).posterior(known[laser])
+        return Kriging(basis.functions, own, shared, open_deviation[laser] ** 2 + common**2)
 
     choices = list(product(RANGES, DEVIATIONS, COMMON))
     middle = len(known) // 2  # one wavelength tells the lengths of all
-    best = choices[int(np.argmax([field(middle, choice)[2] for choice in choices]))]
+    best = max(choices, key=lambda choice: field(middle, choice).likelihood(known[middle]))
     log.info("totals: correlated over %g edges, by %g; %g of a spot's own", *best)
     out = np.empty_like(reflectance)
     for laser, own in enumerate(reflectance):
-        mean, spread, _ = field(laser, best)
+        mean, spread = field(laser, best).posterior(known[laser])
         wanted = np.exp(at_most_zero(mean + shape[laser], np.sqrt(spread))) / exitance_per_flux
         factor = scaling(own, open_area, wanted)
         out[laser] = factor[:, None] * own * factor

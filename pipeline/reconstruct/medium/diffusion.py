@@ -19,9 +19,9 @@ from scipy.linalg import cho_factor, cho_solve
 from hw.base.arrays import F64
 from pipeline.geometry.fresnel import mean_transmittance
 from pipeline.geometry.mesh import RayMesh
-from pipeline.reconstruct.medium.tetrahedra import fill
+from pipeline.reconstruct.medium.tetrahedra import NoMedium, fill
 
-ROUNDS = 20  # of remeshing
+ROUNDS, MOST_OFF = 20, 0.05  # of remeshing; share of the volume that it may lose
 MOST_VERTICES = 2000  # of a scan that is filled as it is; time grows with the cube, and fluence is smooth
 
 
@@ -31,8 +31,8 @@ class Diffusion:
 
     stiffness: (N, N) integrals of grad . grad in mm; mass: (N,) of the linear functions in mm^3; surface: (M, M) what
     leaves, less what enters again, per fluence rate, in mm^2; open_area: (M,) mm^2 of the surface's hat functions,
-    times the share of what leaves there that does not meet the object again; hats: (V, M) values at the surface's nodes
-    -> values at the scan's vertices
+    times the share of what leaves there that leaves for good; hats: (V, M) values at the surface's nodes
+    -> values at the scan's vertices; edge: mean length of the surface's edges, mm
     """
 
     stiffness: F64
@@ -40,10 +40,11 @@ class Diffusion:
     surface: F64
     open_area: F64
     hats: sparse.csr_array
+    edge: float
 
     @classmethod
     def of(cls, scan: trimesh.Trimesh, eta: float) -> Diffusion:
-        """Of a closed scan with a smooth boundary of relative index `eta`."""
+        """Of a closed scan with a smooth boundary of index `eta`. Raises: NoMedium where it cannot be filled."""
         mesh, hats = _coarse(scan)
         tets, surface = fill(mesh), RayMesh.of(mesh)
         count, rows = len(tets.points), np.repeat(np.arange(len(tets.corners)), 4)
@@ -55,8 +56,9 @@ class Diffusion:
         inward = mean_transmittance(eta)  # of diffuse light from outside
         outward = inward / eta**2  # of diffuse light from inside (reciprocity)
         leaving = outward / (2 * (2 - outward))  # flux out per fluence rate
-        exchange = np.diag(surface.vertex_areas) - inward * surface.exchange.toarray()
-        return cls(stiffness, mass, leaving * exchange, surface.open_areas, hats)
+        net = np.diag(surface.vertex_areas) - inward * surface.exchange.toarray()
+        edge = float(mesh.edges_unique_length.mean())
+        return cls(stiffness, mass, leaving * net, surface.open_areas(inward), hats, edge)
 
     def solver(self, diffusivity: float, absorption: float) -> Solver:
         """For D in mm and sigma_a in 1/mm. Raises: LinAlgError where the system is not positive definite."""
@@ -90,13 +92,15 @@ class Solver:
 
 
 def _coarse(scan: trimesh.Trimesh) -> tuple[trimesh.Trimesh, sparse.csr_array]:
-    """A closed mesh of MOST_VERTICES vertices at most, and what carries values on it to the scan's vertices."""
+    """A closed mesh of some MOST_VERTICES vertices at most, and what carries values on it to the scan's vertices."""
     count = len(scan.vertices)
     if count <= MOST_VERTICES:
         return scan, sparse.eye_array(count, format="csr")
     vertices, faces = np.asarray(scan.vertices, np.float64), np.asarray(scan.faces, np.int32)
-    edge = float(scan.edges_unique_length.mean()) * np.sqrt(count / MOST_VERTICES)
+    edge = float(np.sqrt(2.0 * scan.area / (np.sqrt(3.0) * MOST_VERTICES)))  # of as many equilateral triangles
     own = gpytoolbox.remesh_botsch(vertices, faces, ROUNDS, edge, True)
     mesh = trimesh.Trimesh(*own, process=False)
+    if not (len(mesh.faces) and mesh.is_watertight and abs(mesh.volume / scan.volume - 1) < MOST_OFF):
+        raise NoMedium(f"the scan loses its shape with {MOST_VERTICES} vertices, as which it would be filled")
     _, triangle, hat = gpytoolbox.squared_distance(vertices, *own, use_cpp=True)
     return mesh, RayMesh.of(mesh).interpolation(np.asarray(triangle, np.int64), np.asarray(hat, np.float64))

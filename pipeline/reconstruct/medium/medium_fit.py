@@ -11,8 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from hw.base.arrays import F64
+from hw.base.errors import DiscoError
 from pipeline.calibrate.least_squares import Linearised, Prior
 from pipeline.reconstruct.medium.diffusion import Diffusion, Solver
+from pipeline.reconstruct.medium.tetrahedra import NoMedium
 from pipeline.reconstruct.samples.laser_samples import LaserSamples
 from pipeline.reconstruct.samples.samples import Samples
 
@@ -28,10 +30,6 @@ START, SPREAD = (0.2, 5e-3), (1.5, 3.0)  # D and sigma_a in edges and per edge; 
 STEEPEST = 0.5  # fall over an edge: linear elements are then off by a hundredth of it, a tenth over ten edges' worth
 DARKEST = 1e-12  # of the largest fluence rate: what is below are rounding errors
 STEPS, ENOUGH, LONGEST = 12, 0.01, 1.5  # of the logarithms
-
-
-class NoMedium(Exception):
-    """Why the samples show no medium."""
 
 
 @dataclass(frozen=True)
@@ -50,11 +48,11 @@ def fit_medium(
     used = np.flatnonzero(samples.spots.transmitted > 0)
     used = used[np.unique(np.linspace(0, len(used) - 1, MOST_SPOTS).round().astype(np.int64))] if len(used) else used
     measured = LaserSamples.of(samples, laser).at(used)
-    seen = measured.observed & (measured.edges > NEAREST)
+    seen = measured.observed & (measured.edges * samples.edge > NEAREST * diffusion.edge)
     if (count := int(seen.sum())) < FEWEST:
         raise NoMedium(f"{count} samples lie beyond {NEAREST} edges of their spots: {FEWEST} are needed")
     sources, on_surface = (samples.lit[used] @ diffusion.hats).toarray().T, len(diffusion.surface)
-    before = np.array([np.log(START[0] * samples.edge), np.log(START[1] / samples.edge), 0.0])
+    before = np.array([np.log(START[0] * diffusion.edge), np.log(START[1] / diffusion.edge), 0.0])
     prior = Prior(before, np.diag([SPREAD[0] ** -2, SPREAD[1] ** -2, 0.0]))
     x = before if start is None else np.log([start.diffusivity, start.absorption, start.level])
     for step in range(STEPS):
@@ -70,10 +68,16 @@ def fit_medium(
             bright = seen & (measured.value > 0)
             x = np.array([*x[:2], np.median(np.log(measured.value[bright] / mean[bright])) if bright.any() else 0.0])
         relative, weight = measured.residual(mean * np.exp(x[2]))
-        weight = np.where(at_vertices[0] > mean.min(), weight, 0.0)  # what elements are too coarse for tells nothing
+        followed = at_vertices[0] > DARKEST * at_vertices[0].max()
+        weight = np.where(followed, weight, 0.0)  # what elements are too coarse for tells nothing
+        if not weight[seen].any():
+            raise NoMedium("no sample far from its spot is clear of the noise")
         slopes = np.where(weight > 0, at_vertices[1:] / mean, 0.0)
         jacobian = np.stack([slopes[0][seen], slopes[1][seen], np.ones(count)], axis=1)
-        move = Linearised(x, -relative[seen], jacobian, weight[seen] / ALIKE, prior).step()
+        try:
+            move = Linearised(x, -relative[seen], jacobian, weight[seen] / ALIKE, prior).step()
+        except DiscoError:
+            raise NoMedium("the samples leave D and sigma_a open") from None
         x = x + move * min(1.0, LONGEST / np.abs(move).max())
         # By what it does to the samples: where nothing absorbs, sigma_a itself is open.
         if np.sqrt(np.average((jacobian @ move) ** 2, weights=weight[seen])) < ENOUGH:
@@ -81,8 +85,10 @@ def fit_medium(
             break
     else:
         raise NoMedium(f"the fit of D and sigma_a had not converged after {STEPS} steps")
-    if (fall := float(np.exp(0.5 * (x[1] - x[0]))) * samples.edge) > STEEPEST:
-        raise NoMedium(f"light falls by exp(-{fall:.2f}) over an edge of the scan, which elements follow to {STEEPEST}")
+    if (fall := float(np.exp(0.5 * (x[1] - x[0]))) * diffusion.edge) > STEEPEST:
+        raise NoMedium(
+            f"light falls by exp(-{fall:.2f}) over an edge of the elements, which elements follow to {STEEPEST}"
+        )
     return HomogeneousMedium(*np.exp(x).tolist())
 
 
@@ -116,7 +122,8 @@ class MediumPrior:
         count = np.bincount(bin_of, known.ravel(), minlength=BINS)
         sums = (np.bincount(bin_of, (known * x).ravel(), minlength=BINS) for x in (distance, logarithm))
         at, level = (x[count > 0] / count[count > 0] for x in sums)
-        place = np.clip((distance / samples.edge - FADE[0]) / (FADE[1] - FADE[0]), 0.0, 1.0)
+        place = np.clip((distance / diffusion.edge - FADE[0]) / (FADE[1] - FADE[0]), 0.0, 1.0)
         departures = (logarithm - np.interp(distance, at, level)) * (place**2 * (3.0 - 2.0 * place)) * known
-        totals = np.asarray(hats @ np.log(np.maximum(fluence, 0.0) @ diffusion.open_area))
+        leaving = np.maximum(fluence, 0.0) @ diffusion.open_area
+        totals = np.asarray(hats @ np.log(np.maximum(leaving, DARKEST * leaving.max())))
         return cls(departures, np.asarray(samples.lit @ departures), totals)

@@ -11,14 +11,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from scipy.spatial import Delaunay, cKDTree
+from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from hw.base.arrays import F64, I64
 from pipeline.reconstruct.samples.distances import hat_points
 
 SPACING = 1.6  # of the cubic lattices inside, in edges of the scan
 CLEAR = 0.5  # edges between the lattice and the surface
-FLAT = 1e-4  # volume of a tetrahedron that counts, in cubed edges
+FLAT = 1e-4  # volume of a tetrahedron that counts, in cubes of its own longest side at a corner
+
+
+class NoMedium(Exception):
+    """Why no medium is fitted."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,7 @@ class Tetrahedra:
 
 
 def fill(mesh: trimesh.Trimesh) -> Tetrahedra:
-    """The inside of a closed mesh."""
+    """The inside of a closed mesh. Raises: NoMedium where its points span no tetrahedra."""
     vertices, edge = np.asarray(mesh.vertices, np.float64), float(mesh.edges_unique_length.mean())
     step = SPACING * edge
     axes = [np.arange(low, high, step) for low, high in zip(*mesh.bounds, strict=True)]
@@ -44,11 +48,14 @@ def fill(mesh: trimesh.Trimesh) -> Tetrahedra:
     if len(lattice):
         lattice = lattice[cKDTree(hat_points(mesh, 4).points).query(lattice)[0] > CLEAR * edge]
     points = np.concatenate([vertices, lattice])
-    corners = np.asarray(Delaunay(points).simplices, np.int64)
+    try:
+        corners = np.asarray(Delaunay(points).simplices, np.int64)
+    except QhullError:
+        raise NoMedium("the scan's points span no tetrahedra") from None
     corners = corners[_inside(mesh, points[corners].mean(axis=1))]
     sides = points[corners[:, 1:]] - points[corners[:, :1]]
     signed = np.linalg.det(sides) / 6.0
-    kept = np.abs(signed) > FLAT * edge**3
+    kept = np.abs(signed) > FLAT * np.linalg.norm(sides, axis=2).max(axis=1) ** 3
     corners, volumes = corners[kept], np.abs(signed[kept])
     others = np.linalg.inv(sides[kept])  # (T, 3, 3): gradients of the functions of the last three corners
     gradients = np.concatenate([-others.sum(axis=2, keepdims=True), others], axis=2)

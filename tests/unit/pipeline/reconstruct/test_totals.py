@@ -26,14 +26,15 @@ def test_kriging_agrees_with_the_dense_formulas() -> None:
     u, spectrum, noise = rng.standard_normal((40, 12)), rng.uniform(0.1, 1, 12), rng.uniform(0.1, 0.5, 40)
     shared = rng.uniform(0.05, 0.5, 12)
     observed = 3.0 + u @ (np.sqrt(spectrum) * rng.standard_normal(12)) + np.sqrt(noise) * rng.standard_normal(40)
-    mean, variance, likelihood = Kriging(u, spectrum, shared, noise).posterior(observed)
+    kriging = Kriging(u, spectrum, shared, noise)
+    mean, variance = kriging.posterior(observed)
     signal = (u * spectrum) @ u.T
     whole, one = signal + (u * shared) @ u.T + np.diag(noise), np.ones(40)
     level = one @ np.linalg.solve(whole, observed) / (one @ np.linalg.solve(whole, one))
     np.testing.assert_allclose(mean, level + signal @ np.linalg.solve(whole, observed - level), rtol=1e-9)
     np.testing.assert_allclose(variance, np.diag(signal - signal @ np.linalg.solve(whole, signal)), rtol=1e-7)
     exact = multivariate_normal(np.full(40, level), whole).logpdf(observed) + 20 * np.log(2 * np.pi)
-    assert likelihood == pytest.approx(exact, rel=1e-9)
+    assert kriging.likelihood(observed) == pytest.approx(exact, rel=1e-9)
 
 
 @pytest.mark.parametrize(("mean", "deviation"), [(-3.0, 0.1), (-0.05, 0.1), (0.0, 0.1), (0.5, 0.1), (2.0, 0.02)])
