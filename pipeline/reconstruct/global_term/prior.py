@@ -35,7 +35,7 @@ def deviation(edges: F64, far: float) -> F64:
 def far_scatter(samples: Samples, laser: int, at_spots: F64 | float) -> float:
     """Of the logarithms of an object's own samples, far from their spots, about their prior: without their noise.
 
-    at_spots: (S, V) `MediumPrior.at_spots`, or 0. FAR where too few samples are clear of the noise.
+    at_spots: (S, V) `MediumPrior.at_spots`, or 0. NaN where too few samples are clear of the noise.
     """
     measured, pairs = LaserSamples.of(samples, laser), samples.spot_pairs
     fit = fit_profile(pairs, measured, samples.edge, samples.tilt, at_spots)
@@ -44,7 +44,7 @@ def far_scatter(samples: Samples, laser: int, at_spots: F64 | float) -> float:
     noise = measured.variance(expected)
     clear = far & (noise < CLEAR)
     if clear.sum() < FEWEST:
-        return FAR
+        return np.nan
     miss = np.log(np.maximum(measured.value[clear] / expected[clear], LEAST_RATIO))
     scatter = 1.4826 * np.median(np.abs(miss - np.median(miss)))  # of a normal distribution, from its middle half
     return float(np.sqrt(max(scatter**2 - noise[clear].mean(), 0.0)))
@@ -65,6 +65,8 @@ def medium_priors(samples: Samples) -> tuple[list[MediumPrior], float, str]:
     prior = MediumPrior.of(samples, diffusion, found[middle])
     far = _credited(far_scatter(samples, middle, prior.at_spots), np.inf)
     log.info("log R_d scatters by %.3f about distance alone, by %.3f about a homogeneous medium", alone, far)
+    if np.isnan(alone + far):
+        return [], _credited(alone), "too few samples far from their spots are clear of the noise to tell"
     if not far < WORTH * alone:
         because = f"log R_d scatters by {far:.2f} about a homogeneous one, by {alone:.2f} about distance alone"
         return [], _credited(alone), because
@@ -73,4 +75,5 @@ def medium_priors(samples: Samples) -> tuple[list[MediumPrior], float, str]:
 
 
 def _credited(scatter: float, most: float = FAR) -> float:
-    return float(np.clip(scatter, LEAST_FAR, most))
+    """In bounds; where nothing is known, NaN, or `most` if that is finite."""
+    return most if np.isnan(scatter) and np.isfinite(most) else float(np.clip(scatter, LEAST_FAR, most))

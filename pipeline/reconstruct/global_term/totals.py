@@ -86,7 +86,7 @@ def steady_totals(
     """(L, V, V) R_d whose column totals are steadied, symmetric as before.
 
     reflectance: (L, V, V) mm^-2; variance: relative, of what the fill leaves open; open_area: (V,) mm^2 of the hats,
-    times the share of what leaves there that does not meet the object again; exitance_per_flux: Tbar^2, by which sums
+    times the share of what leaves there that leaves for good; exitance_per_flux: Tbar^2, by which sums
     of R_d are what leaves of what arrives; edge: mm; expected: (L, V) logarithms of the totals of a model of the whole
     object, of any level, or None
     """
