@@ -30,6 +30,7 @@ REGISTRY = {
     "reconstruct": "benchmarks.reconstruct",
     "references": "benchmarks.references",
     "regression": "benchmarks.regression",
+    "relight": "benchmarks.relight",
     "resample": "benchmarks.resample",
     "stream": "benchmarks.stream",
     "walk": "benchmarks.walk",

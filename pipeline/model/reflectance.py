@@ -12,8 +12,9 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from hw.base.arrays import F32, F64, I64, Bool
-from pipeline.model.term import Axes, ReflectanceColumns, Term
-from pipeline.model.tilt import TiltLaw
+from pipeline.model.radiosity import RadiosityTerm
+from pipeline.model.term import Axes, ReflectanceColumns
+from pipeline.model.tilt import TiltLaw, gathered, placed, tilt_kernel
 from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 
 _PAIRS = "laser vertex_in vertex_out"
@@ -21,7 +22,7 @@ _ROWS = 512
 
 
 @dataclass(frozen=True)
-class GlobalTerm(Term):
+class GlobalTerm(RadiosityTerm):
     """reflectance: (L, V_in, V_out) mm^-2, symmetric, mean over both hat functions; measured: (V, V) entries that an
     observed spot near one vertex and the other one support; variance: mm^-4, None where the method states none;
     tilt: slopes of the `TiltLaw`s at tilt_distance, None where directions are not known to change anything;
@@ -37,44 +38,28 @@ class GlobalTerm(Term):
     tilt_distance: Annotated[F64 | None, Axes("distance", "mm")] = None
     tilt_variance: Annotated[F64 | None, Axes("laser distance", "1")] = None
 
-    def image(self, light: LightOnMesh, view: ViewOfMesh) -> F32:
-        """Radiosity on the vertices (thesis 5.3: B = E F) and its first moments, linear on the faces."""
-        if light not in self._radiosity:
-            self._radiosity[light] = self._radiosity_under(light)
-        radiosity, *moments = self._radiosity[light]
-        image = view.image(radiosity)
-        for matrix, moment in zip(view.tilted_matrices if moments else (), moments, strict=True):
-            flat = np.asarray(matrix @ moment.T)
-            image += np.moveaxis(flat.reshape(*image.shape[1:], -1), -1, 0).astype(np.float32)
-        return image
+    @property
+    def by_direction(self) -> bool:
+        """Whether there are slopes."""
+        return self.tilt is not None
 
-    def _radiosity_under(self, light: LightOnMesh) -> F64:
-        """(1 or 4, L, V) W/mm^2: the radiosity, and what leaves ahead of it: sums of q R_d s e, by component.
+    def radiosity(self, flux: F64, points: F64) -> F64:
+        """The radiosity, and what leaves ahead of it: sums of q R_d s e, by component.
 
         The factor of either end is kept to first order, their product is left out. Some rows at a time: no matrix is
         kept beside R_d.
         """
         if self.tilt is None or self.tilt_distance is None:
-            return np.stack([q @ r for q, r in zip(light.flux, self.reflectance, strict=True)])[None]
-        points, flux = np.asarray(light.mesh.vertices, np.float64), light.tilted_flux
+            return np.stack([q @ r for q, r in zip(flux[0], self.reflectance, strict=True)])[None]
         out = np.zeros((4, *flux.shape[1:]))
         for first in range(0, len(points), _ROWS):
             rows = slice(first, first + _ROWS)
             distance = cdist(points[rows], points)
             for laser, slopes in enumerate(self.tilt):
                 reflectance = self.reflectance[laser, rows].astype(np.float64)
-                q, *along = flux[:, laser, rows]
-                out[0, laser] += q @ reflectance
-                # q R_d s e with e = (x_o - x_i) / r: the products with x_o stand outside the sum over x_i.
-                law = TiltLaw(self.tilt_distance, slopes)
-                with np.errstate(divide="ignore", invalid="ignore"):
-                    kernel = np.where(distance > 0, reflectance * law(distance) / distance, 0.0)
-                moved = np.stack(
-                    [*along, (np.stack(along, axis=1) * points[rows]).sum(axis=1), q, *(q * points[rows].T)]
-                )
-                a, own, light_here, placed = np.split(moved @ kernel, [3, 4, 5])
-                out[0, laser] += (a.T * points).sum(axis=1) - own[0]
-                out[1:, laser] += light_here * points.T - placed
+                out[0, laser] += flux[0, laser, rows] @ reflectance
+                kernel = tilt_kernel(reflectance, distance, TiltLaw(self.tilt_distance, slopes))
+                out[:, laser] += gathered(placed(flux[:, laser, rows], points[rows]) @ kernel, points)
         return out
 
     def image_variance(self, light: LightOnMesh, view: ViewOfMesh) -> F32 | None:
@@ -91,11 +76,6 @@ class GlobalTerm(Term):
     @cached_property
     def _spread(self) -> WeakKeyDictionary[LightOnMesh, tuple[F64, F64]]:
         """(L, V) by light: variance of the radiosity for independent errors, deviation for errors that are alike."""
-        return WeakKeyDictionary()
-
-    @cached_property
-    def _radiosity(self) -> WeakKeyDictionary[LightOnMesh, F64]:
-        """`_radiosity_under` by light: the product costs more than the image, and serves all views."""
         return WeakKeyDictionary()
 
     def check(self, lasers: int, vertices: int) -> None:

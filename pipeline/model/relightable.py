@@ -16,6 +16,7 @@ from hw.base.errors import InputError
 from hw.base.files import load_arrays, save_arrays
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import Boundary
+from pipeline.model.factorised import FactorisedTerm
 from pipeline.model.lambertian import LambertianTerm
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.term import ReflectanceColumns, Term
@@ -24,7 +25,7 @@ from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 
 FORMAT_VERSION = 2
 WITHOUT = "without "  # in a provenance, before the name of what a method left out; the value is the reason
-KINDS: Mapping[str, type[Term]] = {term.kind: term for term in (GlobalTerm, LambertianTerm)}
+KINDS: Mapping[str, type[Term]] = {term.kind: term for term in (GlobalTerm, LambertianTerm, FactorisedTerm)}
 REMEDY = "reconstruct again with this version"
 
 

@@ -47,3 +47,26 @@ class TiltLaw:
         the shape of r.
         """
         return np.asarray(np.exp(self(r) * tilt))
+
+
+def tilt_kernel(reflectance: F64, distance: F64, law: TiltLaw) -> F64:
+    """R_d s(r) / r in mm^-3, 0 at r = 0; reflectance in mm^-2 and distance in mm, of one shape."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(distance > 0, reflectance * law(distance) / distance, 0.0)
+
+
+def placed(flux: F64, points: F64) -> F64:
+    """(8, N) what a `tilt_kernel` multiplies so that `gathered` has the sums of q R_d s e, with e = (x_o - x_i) / r:
+    the products with x_o stand outside the sum over x_i. flux: (4, N) q and q t in W; points: (N, 3) x_i in mm
+    """
+    q, *along = flux
+    return np.stack([*along, (np.stack(along, axis=1) * points).sum(axis=1), q, *(q * points.T)])
+
+
+def gathered(product: F64, points: F64) -> F64:
+    """(4, N) W/mm^2: what R_d's first order adds to the radiosity, and the radiosity's first moments.
+
+    product: (8, N) `placed` times the kernel; points: (N, 3) x_o in mm
+    """
+    along, own, here, moved = np.split(product, [3, 4, 5])
+    return np.concatenate([(along.T * points).sum(axis=1)[None] - own, here * points.T - moved])
