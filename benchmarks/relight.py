@@ -3,7 +3,7 @@
 The model: the quick scene's object scanned with 8924 vertices (the scanner's mesh has a few more or less), three
 wavelengths, tilt. Its R_d(x, y) = a(x) a(y) f(|x - y|), with a bright narrow and a wide part in f, dark veins of 1.2 mm
 in a, and errors of single entries, since a reconstruction has them. What is timed begins with the flux that a light
-sends through the vertices and ends with radiosity and its angular moments there. Beside it: the flux itself with shadows,
+sends through the vertices and ends with radiosity and its moments there. Beside it: the flux itself with shadows,
 and the image of one view from the moments. Local kernels on texels are no part of any model yet: `kernels` is 0, and
 `pipeline.model.factorise.FACTORISE` is where a term on texels says how it is made fast.
 
