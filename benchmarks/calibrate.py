@@ -31,12 +31,12 @@ from disco_twin.scene.rig_schema import FaultsConfig, TwinRigConfig
 from hw.record import to_radiance
 from pipeline.calibrate import pose as pose_module
 from pipeline.calibrate.intrinsics import find_corners, fit_intrinsics
-from pipeline.calibrate.outline import mesh_mask, object_mask
 from pipeline.calibrate.projector_fit import refine, true_spots
 from pipeline.calibrate.response import TABLE, fit_response
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.nominal_rig import CameraConfig, ProjectorConfig
 from pipeline.geometry.projector import TwoMirrorProjector
+from pipeline.geometry.silhouette import mesh_mask, object_mask
 from pipeline.plan.targets import make_bracket, make_targets
 
 F64 = NDArray[np.float64]

@@ -35,6 +35,7 @@ from pipeline.calibrate.calibrate_rig import measure
 from pipeline.calibrate.calibration import Calibration, nominal_calibration
 from pipeline.calibrate.figures import figures
 from pipeline.calibrate.target_images import has_targets
+from pipeline.capture.silhouettes import examine_silhouettes, silhouettes_of
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import Boundary
 from pipeline.geometry.mesh_file import read_scan
@@ -155,6 +156,11 @@ def run(capture: Path, work: Path, request: Request, given: Path | None = None) 
         calibration, calibrated = calibrate(capture, rig, sensor, mesh, given)
         calibration.save(work / "calibration.json")
         mesh = calibration.calibrated(mesh)
+        with StreamReader(capture) as stream:
+            images = silhouettes_of(stream)
+            fit = examine_silhouettes(images, calibration.sensor, rig, mesh, calibration.view_camera)
+        for line in fit.warnings():
+            log.warning("%s", line)
     samples, statistics = gather(capture, calibration, mesh, settings, stages)
     if statistics.coverage == 0:
         raise InputError("no camera sees any spot's surroundings", file=capture, remedy="check the cameras' poses")
@@ -187,6 +193,7 @@ def run(capture: Path, work: Path, request: Request, given: Path | None = None) 
         "calibration": calibrated,
         "left_out": left_out,
         "warnings": [
+            *fit.warnings(),
             *warnings_of(statistics),
             *(
                 f"pose: the silhouettes leave open: {text}"

@@ -93,10 +93,10 @@ def import_(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The capture that `python -m pipeline` reads.")],
 ) -> None:
     """Turn a capture that was made without this software into ours. Needs no renderer."""
-    from disco_twin.run.progress import stage_bar
+    from disco_twin.run.progress import screen_log, stage_bar
     from pipeline.capture.import_folder import import_capture
 
-    with stage_bar(console, "import", "images") as report:
+    with screen_log(console), stage_bar(console, "import", "images") as report:
         plan_ = import_capture(folder, out, report)
     console.print(f"{len(plan_)} images, {plan_.views} views, {len(plan_.spots)} spots", highlight=False)
 
@@ -123,6 +123,7 @@ def quality(
     """Show the quality of a capture view by view, finished or not. Needs no renderer."""
     from disco_twin.cli.tables import quality_table
     from hw.base.config import read_json
+    from pipeline.capture.poses import pose_warnings
     from pipeline.capture.quality import examine
     from pipeline.records import SensorFile
     from pipeline.stream.stream import StreamReader
@@ -134,6 +135,8 @@ def quality(
     for view in views:
         for remark in view.remarks:
             console.print(f"view {view.view}: {remark}", highlight=False, soft_wrap=True)
+    for line in pose_warnings(capture_folder):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 @app.command()

@@ -22,6 +22,7 @@ from hw.base.files import require_folder, write_atomically
 from hw.rig.rig_file import EMULATED, DevicesFile
 from hw.rig.rig_rules import load_rig_file
 from pipeline.capture.loop import capture
+from pipeline.capture.poses import pose_warnings
 from pipeline.capture.rig_fits_scene import require_reach, require_same, require_scene
 from pipeline.stream.files import IMAGES
 from pipeline.stream.stream import StreamReader
@@ -91,6 +92,8 @@ def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool
             capture(rig, experiment.plan, folder.capture, report, sensor)
 
     run.stage("capture", key, take_images, "images")
+    for warning in pose_warnings(folder.capture):
+        log.warning("%s", warning)
 
 
 def _twin(run: Run, file: DevicesFile) -> TwinRig | None:

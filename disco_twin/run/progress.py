@@ -70,20 +70,32 @@ def stage_bar(console: Console, name: str, unit: str) -> Iterator[Report]:
 @contextmanager
 def run_log(path: Path, console: Console) -> Iterator[None]:
     """Our own log messages of a run go to a file, with times; warnings go to the screen, too, a line each."""
-    screen = _Screen(console)
     file = _LogFile(path, console)
+    try:
+        with screen_log(console), _handling(file):
+            yield
+    finally:
+        file.close()
+
+
+@contextmanager
+def screen_log(console: Console) -> Iterator[None]:
+    """Our own warnings go to the screen, a line each."""
+    with _handling(_Screen(console)):
+        yield
+
+
+@contextmanager
+def _handling(handler: logging.Handler) -> Iterator[None]:
     loggers = [logging.getLogger(name) for name in ("disco_twin", "pipeline", "hw")]
     for logger in loggers:
-        logger.addHandler(file)
-        logger.addHandler(screen)
+        logger.addHandler(handler)
         logger.setLevel(logging.INFO)
     try:
         yield
     finally:
         for logger in loggers:
-            logger.removeHandler(file)
-            logger.removeHandler(screen)
-        file.close()
+            logger.removeHandler(handler)
 
 
 class _Screen(logging.Handler):

@@ -22,6 +22,7 @@ from disco_twin.scene.scene import Profile, Scene, load_scene
 from hw.base.errors import InputError, refused_by_the_disk
 from hw.base.files import write_atomically, write_json
 from pipeline.capture.loop import Interrupted
+from pipeline.capture.poses import pose_warnings
 from pipeline.reconstruct.registry import known_methods, require_method
 from pipeline.records import StageFigures
 from pipeline.stream.files import IMAGES
@@ -178,6 +179,8 @@ def capture_stages(run: Run) -> None:
         run.stage("targets", run.key("targets"), lambda report: take_targets(scene, folder.capture, report), "images")
     take = partial(take_images, experiment, folder.capture, folder.twin / "responses")
     run.stage("capture", run.key("capture"), take, "images")
+    for warning in pose_warnings(folder.capture):
+        log.warning("%s", warning)
 
 
 def truth_stages(run: Run) -> None:

@@ -122,22 +122,10 @@ def edges_along(image: NDArray[np.floating], pixel: F64, normal: F64) -> tuple[F
     return np.clip(found, -REACH, REACH), good
 
 
-def object_mask(image: NDArray[np.floating]) -> Bool:
-    """(H, W) the thesis's silhouette: a threshold, between the background and the darkest parts of the object."""
-    image = np.asarray(image, np.float64)
-    dark, light = np.percentile(image, 5), np.percentile(image, 99)
-    return np.asarray(ndimage.binary_opening(image > dark + 0.15 * (light - dark)))
-
-
 def signed_distance(mask: Bool) -> F64:
     """(H, W) pixels from the mask's border, positive outside."""
     outside, inside = ndimage.distance_transform_edt(~mask), ndimage.distance_transform_edt(mask)
     return np.asarray(np.where(mask, 0.5 - inside, outside - 0.5))
-
-
-def mesh_mask(mesh: trimesh.Trimesh, camera: PinholeCamera) -> Bool:
-    """(H, W) pixels whose centre shows the mesh."""
-    return RayMesh.of(mesh).meets(*camera.rays(camera.pixel_centres())).reshape(camera.height, camera.width)
 
 
 def synthetic(mesh: trimesh.Trimesh, camera: PinholeCamera, image: NDArray[np.floating]) -> F64:

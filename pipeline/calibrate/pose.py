@@ -19,11 +19,12 @@ from scipy.linalg import block_diag
 from hw.base.arrays import F64, I64, Bool
 from pipeline.calibrate.edges import Edges
 from pipeline.calibrate.least_squares import Huber, Linearised
-from pipeline.calibrate.outline import mesh_mask, object_mask, outline, signed_distance
+from pipeline.calibrate.outline import outline, signed_distance
 from pipeline.calibrate.scan_error import surface_error
 from pipeline.calibrate.scan_fit import ScanFit, fit_scan
 from pipeline.calibrate.sweep import LENS, Sweep, lens_rows, place_prior, pose_jacobian
 from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.silhouette import mesh_mask, object_mask
 
 UNDETERMINED_RAD, UNDETERMINED_MM = np.deg2rad(1.0), 5.0  # a direction that is known no better is stated as open
 COARSE_STEPS, FINE_STEPS, EXACT_STEPS = 25, 5, 2

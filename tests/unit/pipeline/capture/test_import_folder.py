@@ -188,8 +188,8 @@ def picture(array: NDArray[np.generic], name: str = "frames/front-0--1--1-0.tif"
             replace("capture.toml", "[1e12, 2e12]", "[1e12]"),
             "sensor.responsivity has 1 of the 2 values",
         ),
-        (replace("capture.toml", "[1e12, 2e12]", "[1e12, -2e12]"), r"sensor.responsivity\[1\] = -2000000000000.*> 0"),
-        (replace("capture.toml", "gain_e_per_dn = 8.0", "gain_e_per_dn = 0.0"), "sensor.gain_e_per_dn = 0.*> 0"),
+        (replace("capture.toml", "[1e12, 2e12]", "[1e12, -2e12]"), r"sensor.responsivity\[1\] = -2000000000000.*>= 1"),
+        (replace("capture.toml", "gain_e_per_dn = 8.0", "gain_e_per_dn = 0.0"), "sensor.gain_e_per_dn = 0.*>= 1e-06"),
         (replace("capture.toml", "offset_dn = 64.0", "offset_dn = 4001.0"), "sensor.offset_dn = 4001 is no less than"),
         (replace("capture.toml", "steps = 4", "steps = 0"), "sensor.steps = 0"),
         (
@@ -276,9 +276,9 @@ def test_frames_that_contradict_their_exposures_are_refused(
 
 
 def test_power_that_differs_within_a_bracket_is_no_contradiction(folder: Path, tmp_path: Path) -> None:
-    """Rationale: one frame of twice the power, and twice the light."""
+    """Rationale: one frame of about twice the power, and of the light."""
     exposed = rate(0, 0, 1000, 0)
-    Image.fromarray(pixels(2 * exposed, LONGEST / 2)).save(folder / "frames" / "front-0-1000-0-1.png")
+    Image.fromarray(pixels(2.1 * exposed, LONGEST / 2)).save(folder / "frames" / "front-0-1000-0-1.png")
     lines = (folder / "images.csv").read_text().splitlines()
     doubled = [line.replace("0.011,", "0.02,") if "front-0-1000-0-1." in line else line for line in lines]
     assert doubled != lines
