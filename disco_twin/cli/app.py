@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.console import Console
 
+from disco_twin.cli.names import given
 from disco_twin.cli.rig import ArmOption, LogsOption, rig_app
 from hw.base.errors import DiscoError, InputError, naming, refused_by_the_disk
 from pipeline.capture.loop import Interrupted
@@ -20,8 +21,8 @@ app = typer.Typer(
 )
 console = Console()
 
-SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="The scene's TOML file.")]
-RunOut = Annotated[Path, typer.Option("--out", metavar="DIR", help="The run folder.")]
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="The scene's TOML file.", parser=given("SCENE"))]
+RunOut = Annotated[Path, typer.Option("--out", metavar="DIR", help="The run folder.", parser=given("--out"))]
 ProfileOption = Annotated[
     Literal["full", "small"], typer.Option(help="`small` shrinks the scene: fewer spots, pixels and walks.")
 ]
@@ -65,7 +66,10 @@ def capture(
     profile: ProfileOption = "full",
     faults: FaultsOption = None,
     rig: Annotated[
-        Path | None, typer.Option(metavar="RIG.TOML", help="Capture with the devices of a rig file, not with the twin.")
+        Path | None,
+        typer.Option(
+            metavar="RIG.TOML", help="Capture with the devices of a rig file, not with the twin.", parser=given("--rig")
+        ),
     ] = None,
     arm: ArmOption = False,
     logs: LogsOption = None,
@@ -89,8 +93,16 @@ def capture(
 
 @app.command("import")
 def import_(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="capture.toml, images.csv and 16-bit frames.")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The capture that `python -m pipeline` reads.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER", help="capture.toml, images.csv and 16-bit frames.", parser=given("FOLDER")),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", metavar="DIR", help="The capture that `python -m pipeline` reads.", parser=given("--out")
+        ),
+    ],
 ) -> None:
     """Turn a capture that was made without this software into ours. Needs no renderer."""
     from disco_twin.run.progress import screen_log, stage_bar
@@ -103,8 +115,8 @@ def import_(
 
 @app.command()
 def mesh(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="A mesh or scan: PLY, OBJ or STL.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="The PLY file that is written.")],
+    source: Annotated[Path, typer.Argument(metavar="IN", help="A mesh or scan: PLY, OBJ or STL.", parser=given("IN"))],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The PLY file that is written.", parser=given("OUT"))],
     size_mm: Annotated[
         float | None, typer.Option(help="Scale it to this largest extent and centre it; left out, both are kept.")
     ] = None,
@@ -118,7 +130,9 @@ def mesh(
 
 @app.command()
 def quality(
-    capture_folder: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture: DIR/capture of a run.")],
+    capture_folder: Annotated[
+        Path, typer.Argument(metavar="CAPTURE", help="A capture: DIR/capture of a run.", parser=given("CAPTURE"))
+    ],
 ) -> None:
     """Show the quality of a capture view by view, finished or not. Needs no renderer."""
     from disco_twin.cli.tables import quality_table
@@ -181,7 +195,7 @@ def score(out: RunOut, methods: MethodsOption = None) -> None:
 
 @app.command()
 def budget(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="The folder of a finished run.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The folder of a finished run.", parser=given("OUT"))],
     methods: Annotated[str | None, typer.Option("--method", help="The method; left out: the scene's first.")] = None,
 ) -> None:
     """Show where a run's relighting error comes from: each part made exact in turn. Renders; minutes, kept in OUT."""
@@ -238,11 +252,11 @@ def main(arguments: list[str] | None = None) -> Any:
     except Interrupted as error:
         return _stop(str(error), 130)
     except typer.Abort:
-        return _stop("stopped", 130)
+        return _stop("stopped; the same command continues", 130)
     except DiscoError as error:
         return _stop(str(error), 2)
     except OSError as error:
-        known = refused_by_the_disk(error, Path.cwd())
+        known = refused_by_the_disk(error, Path())
         reason = f"{error.filename or 'input or output'}: {error.strerror or error}"
         return _stop(str(known or f"{reason}. Remedy: correct the path, repeat the same command"), 2)
     except MemoryError:

@@ -11,6 +11,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from hw.base.children import child_environment, code_command
 from hw.base.resources import total_memory_gb, usable_cores
 
 PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "trimesh", "embreex", "pydantic", "matplotlib", "OpenEXR")
@@ -72,8 +73,10 @@ def render(timeout_s: float) -> Finding:
     """A small render in a subprocess."""
     remedy = "see the message; `pip install karellen-llvm-core` brings a libLLVM that works"
     try:
-        command = [sys.executable, "-c", RENDER]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+        done = subprocess.run(
+            code_command(RENDER), capture_output=True, encoding="utf-8", errors="replace", timeout=timeout_s,
+            check=False, env=child_environment(),
+        )  # fmt: skip
     except subprocess.TimeoutExpired:
         return Finding("render", False, f"a small render did not end within {timeout_s:g} s", remedy)
     if done.returncode == 0:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from disco_twin.cli.names import given
 from hw.base.errors import InputError
 from hw.safety.signals import interruptible, raise_if_interrupted
 from pipeline.capture.loop import Interrupted
@@ -24,13 +25,17 @@ console = Console()
 
 LONGEST_S = 1e7  # that devices are emulated: 116 days
 
-RigPath = Annotated[Path, typer.Argument(metavar="RIG.TOML", help="The rig file.")]
+RigPath = Annotated[Path, typer.Argument(metavar="RIG.TOML", help="The rig file.", parser=given("RIG.TOML"))]
 SceneOption = Annotated[
-    Path | None, typer.Option("--scene", metavar="SCENE", help="The scene, which has the cameras' sizes.")
+    Path | None,
+    typer.Option("--scene", metavar="SCENE", help="The scene, which has the cameras' sizes.", parser=given("--scene")),
 ]
 ArmOption = Annotated[bool, typer.Option("--arm", help="Let real lasers emit.")]
 LogsOption = Annotated[
-    Path | None, typer.Option("--logs", metavar="DIR", help="Keep every byte to and from the devices there.")
+    Path | None,
+    typer.Option(
+        "--logs", metavar="DIR", help="Keep every byte to and from the devices there.", parser=given("--logs")
+    ),
 ]
 
 
@@ -52,8 +57,13 @@ def selftest(rig: RigPath, scene: SceneOption = None, arm: ArmOption = False, lo
 
 @rig_app.command()
 def emulate(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="The scene whose devices are emulated.")],
-    folder: Annotated[Path, typer.Option("--ports", metavar="DIR", help="Where the ports and rig.toml appear.")],
+    scene: Annotated[
+        Path, typer.Argument(metavar="SCENE", help="The scene whose devices are emulated.", parser=given("SCENE"))
+    ],
+    folder: Annotated[
+        Path,
+        typer.Option("--ports", metavar="DIR", help="Where the ports and rig.toml appear.", parser=given("--ports")),
+    ],
     seconds: Annotated[float, typer.Option(help="How long.")] = 3600.0,
 ) -> None:
     """Serve the devices of a scene on pseudo-terminals, in real time, and write the rig file that reaches them."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 
 from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.scene.scene import Scene
+from hw.base.children import child_environment, module_command
 from hw.base.config import read_json
 from hw.base.errors import DiscoError
 from hw.base.files import write_json
@@ -47,12 +47,15 @@ def reconstruct_apart(
     """
     request, before = folder.work / REQUEST, _record(folder) if kept else {}
     write_json(request, pipeline_inputs(scene, methods))
-    command = [sys.executable, "-m", "pipeline", str(folder.capture), str(folder.work), "--request", str(request)]
-    command += ["--until-stdin-closes", *(() if calibration is None else ("--calibration", str(calibration)))]
-    with tempfile.TemporaryFile("w+") as errors:
+    options = ["--until-stdin-closes", *(() if calibration is None else ("--calibration", str(calibration)))]
+    paths = str(folder.capture), str(folder.work), "--request", str(request)
+    command = module_command("pipeline", *paths, *options)
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors:
         with (
-            (folder.work / "pipeline.log").open("w") as log,
-            subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=errors) as child,
+            (folder.work / "pipeline.log").open("wb") as log,
+            subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=log, stderr=errors, env=child_environment()
+            ) as child,
         ):
             try:
                 status = child.wait()

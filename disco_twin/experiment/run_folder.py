@@ -1,6 +1,7 @@
 """The run folder: where things lie, whose scene it is, and which stages are finished (so that a run can resume).
 
-OUT/scene.toml  run.log  stages.json  summary.json  report.html
+OUT/scene.toml  scene.json  run.log  stages.json  summary.json  report.html
+OUT/inputs/     copies of the files that the scene names: meshes, media
 OUT/capture/    all that the pipeline reads        OUT/work/   the pipeline's outputs
 OUT/twin/       what the pipeline never sees: the simulated responses, truth, references
 """
@@ -14,7 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from disco_twin.scene.scene import Scene
 from hw.base.config import Strict, as_table, read_json
@@ -27,6 +28,7 @@ log = logging.getLogger(__name__)
 
 FORMAT_VERSION = 2
 FOLDERS = ("capture", "twin", "work")
+INPUTS = "inputs"  # copies of the files that the scene names
 
 
 @dataclass
@@ -62,10 +64,28 @@ class RunFolder:
     def __post_init__(self) -> None:
         self.capture, self.twin, self.work = (self.root / name for name in FOLDERS)
         self.scene_file, self.journal = self.root / "scene.toml", self.root / "stages.json"
-        self.scene_record = self.root / "scene.json"  # the scene as it was run: profile applied, file names absolute
+        self.scene_record = self.root / "scene.json"  # the scene as it was run: profile applied, files from `inputs`
         self.summary_file, self.report_file = self.root / "summary.json", self.root / "report.html"
         self.scores_file = self.twin / "scores.json"  # with the truth that they were made from
         self.devices_record = self.capture / "devices.toml"  # the rig file of a capture by devices
+
+    def write_scene(self, scene: Scene) -> None:
+        """Write `scene_record`, with copies of the files that the scene names: the folder may be moved elsewhere."""
+
+        def kept(value: Any) -> Any:
+            if isinstance(value, dict):
+                return {key: kept(v) for key, v in value.items()}
+            if isinstance(value, list | tuple):
+                return [kept(v) for v in value]
+            if not isinstance(value, Path):
+                return value
+            name = f"{INPUTS}/{file_digest(value)[:8]}-{value.name}"
+            (self.root / INPUTS).mkdir(exist_ok=True)
+            if not (self.root / name).is_file() or file_digest(self.root / name) != file_digest(value):
+                write_atomically(self.root / name, value.read_bytes())
+            return name
+
+        write_json(self.scene_record, kept(scene.model_dump()))
 
     def read_scene(self) -> Scene:
         """Read `scene_record`. Raises: InputError."""

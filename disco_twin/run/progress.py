@@ -43,8 +43,9 @@ def stage_bar(console: Console, name: str, unit: str) -> Iterator[Report]:
     if not console.is_terminal:
         yield lambda done, total: None
         return
+    plain = not console.encoding.lower().startswith("utf")
     columns = (
-        SpinnerColumn(),
+        SpinnerColumn("line" if plain else "dots"),
         TextColumn("{task.description:<12}"),
         BarColumn(bar_width=None),
         MofNCompleteColumn(),
@@ -114,7 +115,7 @@ class _LogFile(logging.FileHandler):
     """run.log. A disk that takes no more of it is reported once, on the screen, and does not end the run."""
 
     def __init__(self, path: Path, console: Console) -> None:
-        super().__init__(path, encoding="utf-8")
+        super().__init__(path, encoding="utf-8", errors="backslashreplace")
         self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         self.console, self.refused = console, False
 

@@ -35,10 +35,24 @@ def require_capturable(experiment: Experiment) -> None:
         raise InputError(problem, key="rig.cameras", value=sorted(sizes), remedy=remedy)
     for i, view in enumerate(experiment.scene.relight.views):
         require_in_sight(view, experiment.scan, f"relight.views[{i}]", f"the held-out view {view.name!r}")
+    require_scattering(experiment)
     experiment.plan  # noqa: B018 - the plan refuses cameras, projector and spots that cannot be
     experiment.beyond_neck  # noqa: B018 - refuses a neck beside the object
     if rig.faults.deviation and rig.spots < LEAST_SPOTS:
         raise InputError(
             "too few to find the projector from, and the rig is off the nominal one", key="rig.spots", value=rig.spots,
             allowed=f"at least {LEAST_SPOTS} that a camera sees", remedy="more spots, or --no-faults",
+        )  # fmt: skip
+
+
+def require_scattering(experiment: Experiment) -> None:
+    """Refuse an object in which no light is scattered: nothing of it would come out again. Raises: InputError."""
+    medium = experiment.object.medium
+    dark = [k for k, (t, a) in enumerate(zip(medium.sigma_t, medium.albedo, strict=True)) if not (t * a).any()]
+    if dark:
+        nm = ", ".join(f"{experiment.scene.rig.lasers[k].wavelength_nm:g}" for k in dark)
+        raise InputError(
+            f"nothing scatters light of {nm} nm in the object: sigma_t times albedo is 0 everywhere",
+            key="object.medium", allowed="more than 0 somewhere",
+            remedy="more sigma_t or albedo, or leave the laser out",
         )  # fmt: skip

@@ -115,7 +115,7 @@ def begin_run(
     scene = load_scene(scene_file, profile, faults)
     chosen = choose_methods(methods, scene)
     folder = RunFolder.claim(out, scene_file, identity(scene))
-    write_atomically(folder.scene_record, scene.model_dump_json(indent=1).encode())
+    folder.write_scene(scene)
     return Run(Experiment(scene), folder, scene_file, chosen, console)
 
 

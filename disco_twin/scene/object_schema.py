@@ -159,6 +159,9 @@ Shape = Annotated[MeshFile | Pebble | Sphere | Box | Torus | Blend | Extrusion, 
 
 
 # ---------------------------------------------------------------- boundary
+LEAST_ETA = 1.001  # Mitsuba takes no rough dielectric of 1
+
+
 class BoundaryConfig(Strict):
     """Surface of the object: a dielectric of index `eta`, microfacet roughness `alpha` (GGX), or no boundary at all."""
 
@@ -172,6 +175,15 @@ class BoundaryConfig(Strict):
         if kind == "smooth":
             raise ValueError("no walk connects to a camera through a smooth boundary; take 'rough' with alpha = 0.02")
         return kind
+
+    @model_validator(mode="after")
+    def _refracts(self) -> BoundaryConfig:
+        if self.kind == "rough" and self.eta < LEAST_ETA:
+            raise ValueError(
+                f"eta = {self.eta:g} bends no light, which a rough boundary has to (allowed: {LEAST_ETA:g} to 3); take "
+                "kind = 'matched' for an object without a boundary"
+            )
+        return self
 
 
 # ---------------------------------------------------------------- medium: what fills the object before features

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,7 +18,9 @@ from pipeline.relight.lights import Colour, Light, shipped_lights
 
 Count = Annotated[int, Field(ge=1, lt=2**32)]  # photons are numbered in 32 bits
 Profile = Literal["full", "small"]
+FILE_NAME, LONGEST_NAME = r"[a-z0-9_-]+", 32  # as of cameras
 DEFAULT_WALKS = 200_000
+SHIPPED_NM = (635.0, 532.0, 476.0)  # of the colours of shipped lights
 SPOT_BUDGETS = ("walks_per_spot", "spot_seconds", "spot_noise")
 
 
@@ -75,6 +78,18 @@ class RelightConfig(Strict):
             raise ValueError(f"unknown light {unknown[0]!r}, shipped are {', '.join(shipped)}")
         return tuple(shipped[light] if isinstance(light, str) else light for light in lights or shipped)
 
+    @field_validator("lights")
+    @classmethod
+    def _names_of_files(cls, lights: tuple[Light, ...]) -> tuple[Light, ...]:
+        for light in lights:
+            if len(light.name) > LONGEST_NAME or not re.fullmatch(FILE_NAME, light.name):
+                shown = light.name if len(light.name) <= LONGEST_NAME else f"{light.name[:LONGEST_NAME]}..."
+                raise ValueError(
+                    f"the name {shown!r} is to be part of a file's name, as a camera's is (allowed: 1 to "
+                    f"{LONGEST_NAME} small letters, digits, _ and -)"
+                )
+        return lights
+
 
 class Scene(Strict):
     """Everything about one run."""
@@ -88,6 +103,13 @@ class Scene(Strict):
     simulation: SimulationConfig = SimulationConfig()
     reconstruct: ReconstructConfig = ReconstructConfig()
     relight: RelightConfig
+
+    @model_validator(mode="after")
+    def _lights_for_lasers(self) -> Scene:
+        """Lights whose colour the scene does not state have one for these lasers, however many they are."""
+        lights = tuple(_for_lasers(light, self) for light in self.relight.lights)
+        object.__setattr__(self, "relight", self.relight.model_copy(update={"lights": lights}))
+        return self
 
     @model_validator(mode="after")
     def _consistent(self) -> Scene:
@@ -108,6 +130,26 @@ class Scene(Strict):
             columns = self.simulation.truth_columns
             raise ValueError(f"simulation.truth_columns = {columns}: more than half of scan.vertices")
         return self
+
+
+def _for_lasers(light: Light, scene: Scene) -> Light:
+    """A light, with the shipped colour at the nearest of the shipped wavelengths where its own is not stated."""
+    wavelengths = [laser.wavelength_nm for laser in scene.rig.lasers]
+    if len(wavelengths) == len(SHIPPED_NM):
+        return light
+    nearest = [min(range(len(SHIPPED_NM)), key=lambda k: abs(SHIPPED_NM[k] - nm)) for nm in wavelengths]
+
+    def picked(colour: Colour) -> Colour:
+        return tuple(colour[k] for k in nearest)
+
+    if light.kind != "environment":
+        stated = "colour" in light.model_fields_set
+        return light if stated else light.model_copy(update={"colour": picked(light.colour)})
+    if light in shipped_lights(scene.relight.views[0].position_mm):
+        lobes = tuple(lobe.model_copy(update={"radiance": picked(lobe.radiance)}) for lobe in light.lobes)
+        return light.model_copy(update={"constant": picked(light.constant), "lobes": lobes})
+    stated = "constant" in light.model_fields_set
+    return light if stated else light.model_copy(update={"constant": picked(light.constant)})
 
 
 def _colours(light: Light) -> list[Colour]:

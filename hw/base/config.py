@@ -132,10 +132,13 @@ def _numbers(data: Any, key: str = "") -> Iterator[tuple[str, int]]:
 
 
 def read_json(path: Path, schema: type[T], remedy: str) -> T:
-    """Read and validate a JSON file that a program wrote. Raises: InputError for any failure or another version."""
+    """Read and validate a JSON file that a program wrote; file names inside it are relative to its folder.
+
+    Raises: InputError for any failure or another version.
+    """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-        return TypeAdapter(schema).validate_python(data)
+        return TypeAdapter(schema).validate_python(data, context={"folder": path.resolve().parent})
     except FileNotFoundError as error:
         raise InputError("is missing", file=path, remedy=remedy.removeprefix("delete it, then ")) from error
     except OSError as error:

@@ -16,14 +16,12 @@ import select
 import signal
 import socket
 import subprocess
-import sys
 import termios
 import threading
-from pathlib import Path
 
 from serial import PortNotOpenError, SerialBase, SerialException, SerialTimeoutException
 
-import hw
+from hw.base.children import child_environment, module_command
 from hw.safety.guard import IS_OFF, OFF_AS_STOPPED, READY, UNCONFIRMED, GuardClosed, stopped
 
 log = logging.getLogger(__name__)
@@ -109,14 +107,13 @@ class GuardedPort(SerialBase):
         """Start a guard, whose first word switches the laser off; our end of its socket."""
         url = str(self.port).removeprefix(PREFIX)
         ours, theirs = socket.socketpair()
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(hw.__path__[0]).parent), *sys.path[1:]])}
         shared = [theirs.fileno(), _SIGNALS.reader()]
         options = [url, str(self.baudrate), *map(str, shared), str(os.getpid())]
-        command = [sys.executable, "-m", "hw.safety.guard", *options]
+        command = module_command("hw.safety.guard", *options)
         try:
             with theirs:
                 self._guard = subprocess.Popen(
-                    command, pass_fds=shared, env=environment, stdin=subprocess.DEVNULL, start_new_session=True
+                    command, pass_fds=shared, env=child_environment(), stdin=subprocess.DEVNULL, start_new_session=True
                 )
         except BaseException:
             ours.close()

@@ -27,6 +27,7 @@ from disco_twin.object.mesh import read_mesh
 from disco_twin.object.voxels import read_voxels
 from disco_twin.run.progress import run_log
 from disco_twin.run.scan import require_capturable
+from disco_twin.scene.object_schema import MediumConfig
 from disco_twin.scene.scene import Scene, load_scene
 from hw.base.config import read_json
 from hw.base.errors import InputError, naming, refused_by_the_disk
@@ -101,6 +102,17 @@ def test_too_few_spots_are_refused_before_they_are_taken() -> None:
         )
     one_line(caught, "rig.spots = 3", "at least 12", "Remedy: ")
     require_capturable(sphere(cameras=[CAMERA | {"position_mm": (450, 0, 50)}], spots=3))
+
+
+@pytest.mark.parametrize("base", [{"sigma_t_per_mm": 0.0, "albedo": 0.9}, {"sigma_t_per_mm": 1.0, "albedo": 0.0}])
+def test_an_object_that_scatters_nothing(base: dict[str, float]) -> None:
+    experiment = sphere()
+    medium = MediumConfig.model_validate({"base": base | {"kind": "homogeneous"}})
+    changed = experiment.scene.object.model_copy(update={"medium": medium})
+    experiment.scene = experiment.scene.model_copy(update={"object": changed})
+    with pytest.raises(InputError) as caught:
+        require_capturable(experiment)
+    one_line(caught, "object.medium: nothing scatters light of 635, 532, 476 nm", "Remedy: ")
 
 
 @pytest.mark.parametrize(

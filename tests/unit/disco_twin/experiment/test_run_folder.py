@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from scene_texts import GOOD
 
-from disco_twin.experiment.keys import content_key
+from disco_twin.experiment.keys import content_key, identity
 from disco_twin.experiment.run_folder import RunFolder
+from disco_twin.object.build import build_object
+from disco_twin.scene.scene import load_scene
 from hw.base.errors import InputError
 from hw.base.files import write_atomically
 from hw.base.resources import measured, usable_cores
@@ -144,3 +149,19 @@ def test_a_damaged_journal_loses_nothing(tmp_path: Path, scene: Path) -> None:
     with pytest.raises(InputError, match="format_version"):
         RunFolder.claim(tmp_path / "out", scene, "one")
     assert again.journal.read_text() == newer
+
+
+def test_a_folder_that_was_moved_holds_what_its_scene_names(tmp_path: Path) -> None:
+    there = tmp_path / "there"
+    there.mkdir()
+    trimesh.creation.icosphere(subdivisions=2, radius=20).export(there / "ball.ply")
+    (there / "scene.toml").write_text(GOOD.replace('kind = "sphere"', 'kind = "mesh"\nfile = "ball.ply"', 1))
+    scene = load_scene(there / "scene.toml")
+    RunFolder.claim(there / "out", there / "scene.toml", identity(scene)).write_scene(scene)
+    (there / "out").rename(tmp_path / "out")
+    shutil.rmtree(there)
+    moved = RunFolder.open(tmp_path / "out")
+    found = moved.read_scene()
+    assert identity(found) == moved.identity
+    assert build_object(found).mesh.volume == pytest.approx(trimesh.creation.icosphere(2, 20).volume, rel=1e-5)
+    assert found.relight == scene.relight and found.rig == scene.rig

@@ -10,7 +10,9 @@ from scene_texts import GOOD
 from disco_twin.scene.scene import load_scene
 from hw.base.config import Strict, check
 from hw.base.errors import InputError
+from pipeline.relight.lights import Environment, Uniform
 
+LIGHT = '[[relight.lights]]\nkind = "uniform"\nname = "{}"\n[scan]'
 # what is replaced, by what, and what the message must say
 BAD = [
     ('kind = "sphere"', 'kind = "sphere"\nradios_mm = 3', ["object.shape.radios_mm", "unknown key", "'radius_mm'"]),
@@ -56,6 +58,12 @@ BAD = [
         '[object.boundary]\nkind = "smooth"\n[scan]',
         ["object.boundary.kind = 'smooth'", "camera", "'rough' with alpha = 0.02"],
     ),
+    ("[scan]", "[object.boundary]\neta = 1.0\n[scan]", ["object.boundary", "eta = 1 bends no light", "'matched'"]),
+    ("[scan]", LIGHT.format("studio/key"), ["relight.lights", "'studio/key'", "small letters"]),
+    ("[scan]", LIGHT.format("../up"), ["relight.lights", "'../up'", "small letters"]),
+    ("[scan]", LIGHT.format("Key"), ["relight.lights", "'Key'", "small letters"]),
+    ("[scan]", LIGHT.format(""), ["relight.lights", "''", "1 to 32"]),
+    ("[scan]", LIGHT.format("k" * 300), ["relight.lights", "kkkk...", "1 to 32"]),
     ("[scan]", '[relight]\nlights = ["moon"]\n[scan]', ["relight.lights", "unknown light 'moon'", "uniform"]),
     ("[scan]", '[[relight.lights]]\nkind = "uniform"\ncolour = [1.0]\n[scan]', ["relight.lights", "3 values"]),
     ("[scan]", "[relight.neck]\nthrough_mm = [0.0, 0.0]\n[scan]", ["relight.neck.through_mm"]),
@@ -90,6 +98,27 @@ def test_the_good_scene_is_good(tmp_path: Path) -> None:
     scene = load_scene(path)
     assert scene.name == "good"
     assert len(scene.relight.lights) == 7
+
+
+@pytest.mark.parametrize(("lasers", "kept"), [((635.0,), (0,)), ((640.0, 473.0), (0, 2)), ((488.0,), (2,))])
+def test_lights_without_a_stated_colour_fit_any_number_of_lasers(
+    lasers: tuple[float, ...], kept: tuple[int, ...], tmp_path: Path
+) -> None:
+    """The shipped lights, and a light of one's own that states none, have the colour of the nearest wavelength."""
+    path = tmp_path / "scene.toml"
+    tables = "\n".join(f"[[rig.lasers]]\nwavelength_nm = {nm}" for nm in lasers)
+    text = GOOD.replace("albedo = [0.9, 0.8, 0.7]", "albedo = 0.9")
+    path.write_text(f"{text}\n{tables}\n")
+    lights = {light.name: light for light in load_scene(path).relight.lights}
+    assert len(lights) == 7
+    uniform, environment = lights["uniform"], lights["environment"]
+    assert isinstance(uniform, Uniform) and uniform.colour == (1.0,) * len(lasers)
+    assert isinstance(environment, Environment)
+    assert environment.constant == tuple((0.15, 0.2, 0.3)[k] for k in kept)
+    assert environment.lobes[0].radiance == tuple((6.0, 5.0, 4.0)[k] for k in kept)
+    path.write_text(f"{text}\n{tables}\n[[relight.lights]]\nkind = 'uniform'\nname = 'own'\n")
+    (own,) = load_scene(path).relight.lights
+    assert isinstance(own, Uniform) and own.colour == (1.0,) * len(lasers)
 
 
 def test_files_that_are_no_scene(tmp_path: Path) -> None:
