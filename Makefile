@@ -11,7 +11,7 @@ unexport PYTHONDONTWRITEBYTECODE  # containers set it; each of the many processe
 
 .PHONY: help
 help:
-	@echo "make demo      capture, reconstruct and relight scenes/quick.toml; the report lies in $(OUT)/report.html"
+	@echo "make demo      capture, reconstruct and relight scenes/quick.toml; see $(OUT)/report.html, relight in $(OUT)/view.html"
 	@echo "make test      the tests, on every core (minutes)"
 	@echo "make lint      style, types, import rules"
 	@echo "make validate  the slow tests as well: the figures that quick must reach, among them"
@@ -38,10 +38,12 @@ $(CLIENTS): $(READY)
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[clients]'
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[luxx]'
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[genicam]'
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[browser]'
 	@touch $@
 
 demo: $(READY)
 	$(BIN)/disco-twin run scenes/quick.toml --out $(OUT)
+	$(BIN)/disco-twin view $(OUT)
 
 # The laser's timing alone. Then what waits for devices, in a process of its own that gets a core whenever it wants one,
 # beside what computes, on every core; each worker's linear algebra keeps to one of them.

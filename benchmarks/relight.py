@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +37,7 @@ from pipeline.relight.on_mesh import LightOnMesh
 
 SCENE = Path(__file__).resolve().parents[1] / "scenes" / "quick.toml"
 VERTICES, SMALL = 8924, 500
-CHOSEN = Truncation()
-OTHERS = (Truncation(24, 64, 24), Truncation(48, 64, 24), Truncation(48, 128, 48), Truncation(96, 64, 24),
-          Truncation(96, 128, 24), Truncation(96, 256, 96), Truncation(192, 128, 48))  # fmt: skip
+OTHERS = ((128, 16, 4), (128, 16, 8), (224, 32, 4), (320, 32, 8))
 WIDE_MM, NARROW_MM = (6.0, 5.0, 4.0), 0.8  # lengths over which R_d falls, by wavelength
 VEIN_MM, SPACING_MM, NOISE = 1.2, 9.0, 0.03
 REPEATS = 20
@@ -120,14 +119,15 @@ def run(quick: bool = False) -> dict[str, Any]:
         term.radiosity(lights[0].tilted_flux, points)
         took = seconds(lambda: term.radiosity(lights[0].tilted_flux, points))
         rows = errors(term, lights, exact)
-        settings = {"near": cut.near, "rank": cut.rank, "tilt_rank": cut.tilt_rank, "prepared_s": round(prepared, 1)}
+        settings = asdict(cut) | {"prepared_s": round(prepared, 1)}
         return term, {"seconds": took, "error": max(r["error"] for r in rows), "settings": settings}, rows
 
-    term, chosen, rows = point(CHOSEN)
+    cut = Truncation.of(len(points))
+    term, chosen, rows = point(cut)
     view = model.seen_by(PinholeCamera.from_config(scene.relight.views[0]))
     prepare_s = seconds(lambda: (view.matrix, view.tilted_matrices), 1)
     raster_s = seconds(lambda: term.image(lights[0], view))  # its radiosity is kept by light
-    others = [point(cut)[1] for cut in (OTHERS[:2] if quick else OTHERS)]
+    others = [point(Truncation(*cut))[1] for cut in (OTHERS[:2] if quick else OTHERS)]
     worst = max(range(len(rows)), key=lambda n: rows[n]["error"])
     return {
         "frames_per_s": 1 / chosen["seconds"],
@@ -140,9 +140,7 @@ def run(quick: bool = False) -> dict[str, Any]:
         "vertices": len(points),
         "kernels": 0,
         "lasers": 3,
-        "near": CHOSEN.near,
-        "rank": CHOSEN.rank,
-        "tilt_rank": CHOSEN.tilt_rank,
+        "truncation": asdict(cut),
         "prepare_s": chosen["settings"]["prepared_s"],
         "view_s": prepare_s,
         "raster_s": raster_s,

@@ -215,6 +215,26 @@ def budget(
 
 
 @app.command()
+def view(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The folder of a finished run.", parser=given("OUT"))],
+    file: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE.html", help="Left out: view.html in OUT.", parser=given("--out")),
+    ] = None,
+    method: Annotated[str | None, typer.Option("--method", help="The method; left out: the first.")] = None,
+    rank: Annotated[int | None, typer.Option("--rank", min=1, help="Of the far part; lower is smaller.")] = None,
+) -> None:
+    """Write a page in which the object is relit by hand: one file, opened by any browser. Needs no renderer."""
+    from disco_twin.experiment.run_folder import RunFolder
+    from disco_twin.view.page import write_page
+
+    folder = RunFolder.open(out)
+    path = folder.view_file if file is None else file
+    size = write_page(folder, path, method, rank)
+    console.print(f"page: {path.resolve()} ({size:.1f} MB)", soft_wrap=True, highlight=False)
+
+
+@app.command()
 def plan(scene: SceneFile, profile: ProfileOption = "full") -> None:
     """Predict images, bytes and time of a scene, and list what it leaves out. Needs no renderer."""
     from disco_twin.experiment.experiment import Experiment

@@ -1,6 +1,6 @@
 """The run folder: where things lie, whose scene it is, and which stages are finished (so that a run can resume).
 
-OUT/scene.toml  scene.json  run.log  stages.json  summary.json  report.html
+OUT/scene.toml  scene.json  run.log  stages.json  summary.json  report.html  view.html
 OUT/inputs/     copies of the files that the scene names: meshes, media
 OUT/capture/    all that the pipeline reads        OUT/work/   the pipeline's outputs
 OUT/twin/       what the pipeline never sees: the simulated responses, truth, references
@@ -66,6 +66,7 @@ class RunFolder:
         self.scene_file, self.journal = self.root / "scene.toml", self.root / "stages.json"
         self.scene_record = self.root / "scene.json"  # the scene as it was run: profile applied, files from `inputs`
         self.summary_file, self.report_file = self.root / "summary.json", self.root / "report.html"
+        self.view_file = self.root / "view.html"
         self.scores_file = self.twin / "scores.json"  # with the truth that they were made from
         self.devices_record = self.capture / "devices.toml"  # the rig file of a capture by devices
 

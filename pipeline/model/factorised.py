@@ -1,8 +1,10 @@
 """Relighting at interactive rates: R_d as a sparse near part and a far part of low rank, with a bound of the error.
 
-Between near vertices R_d is steep, but there are few of them: their entries are exact. Between the others it is smooth:
-a sum of products of few functions. A light then costs O(V (near + rank)) in place of O(V^2). Angular moments go the
-same way, by a kernel of their own (`pipeline.model.tilt.tilt_kernel`). `pipeline.model.factorise` makes such terms.
+Vertices are gathered in small patches. Between near patches R_d is steep, but there are few such pairs: their entries
+are exact. Between two others it is smooth: a product of few functions on the one patch, of few on the other, and of a
+small matrix that couples them. So every part of R_d is held to its own size, the dark ones too. A light then costs
+O(V near + modes^2) in place of O(V^2). Angular moments go the same way, by a kernel of their own
+(`pipeline.model.tilt.tilt_kernel`) on the same functions. `pipeline.model.factorise` makes such terms.
 """
 
 from __future__ import annotations
@@ -14,49 +16,72 @@ from functools import cached_property
 from typing import Annotated, ClassVar
 
 import numpy as np
-from scipy import sparse
 
 from hw.base.arrays import F32, F64, I64
 from pipeline.model.radiosity import RadiosityTerm
 from pipeline.model.term import Axes, ReflectanceColumns
 from pipeline.model.tilt import gathered, placed
 
+_MODES = "laser mode_in mode_out"
 
-@dataclass(frozen=True)
+
 class Kernel:
-    """A symmetric (V, V) matrix near + basis @ diag(weight) @ basis.T. basis: (V, k); weight: (k,)."""
+    """A symmetric (V, V) matrix: entries at pairs, and a product of functions on patches with their coupling.
 
-    near: sparse.csr_array
-    basis: F32
-    weight: F32
+    pair: (2, N), near: (N,), patch: (V,), basis: (V, k), coupling: (C k, C k), as in `FactorisedTerm`. Blocks between
+    patches of one (padded) size multiply several times faster than single entries.
+    """
+
+    def __init__(self, pair: I64, near: F32, patch: I64, basis: F32, coupling: F32) -> None:
+        self.coupling = coupling
+        count = np.bincount(patch)
+        self._patches, self._size = len(count), int(count.max())
+        order = np.argsort(patch, kind="stable")
+        place = np.empty(len(patch), np.int64)
+        place[order] = np.arange(len(patch)) - np.repeat(np.cumsum(count) - count, count)
+        self._slot = patch * self._size + place  # of a vertex among its patch's padded ones
+        self._basis = np.zeros((self._patches, self._size, basis.shape[1]), np.float32)
+        self._basis[patch, place] = basis
+        both = pair[0] != pair[1]
+        row, column = (np.concatenate([pair[k], pair[1 - k][both]]) for k in (0, 1))
+        number, block = np.unique(patch[row] * self._patches + patch[column], return_inverse=True)
+        self._blocks = np.zeros((len(number), self._size, self._size), np.float32)
+        self._blocks[block, place[row], place[column]] = np.concatenate([near, near[both]])
+        self._column = number % self._patches
+        self._starts = np.searchsorted(number // self._patches, np.arange(self._patches))
 
     def __call__(self, vectors: F64) -> F64:
         """(n, V) products with the rows of (n, V)."""
-        columns = np.ascontiguousarray(vectors.T, np.float32)
-        out = self.near @ columns
-        if len(self.weight):
-            out = out + self.basis @ (self.weight[:, None] * (self.basis.T @ columns))
-        return np.asarray(out.T, np.float64)
+        padded = np.zeros((self._patches * self._size, len(vectors)), np.float32)
+        padded[self._slot] = vectors.T
+        columns = padded.reshape(self._patches, self._size, -1)
+        out = np.add.reduceat(self._blocks @ columns[self._column], self._starts, axis=0)
+        if len(self.coupling):
+            entering = self._basis.swapaxes(1, 2) @ columns
+            leaving = self.coupling @ entering.reshape(-1, len(vectors))
+            out += self._basis @ leaving.reshape(entering.shape)
+        return np.asarray(out.reshape(len(padded), -1)[self._slot].T, np.float64)
 
 
 @dataclass(frozen=True)
 class FactorisedTerm(RadiosityTerm):
-    """pair: (2, N) vertices near each other, the first not above the second; near: (L, N) what the pairs' entries of
-    R_d are beyond the far part; basis: (L, V, k) and weight: (L, k), the far part; error: (L,) bounds of the norm of
-    what is left of R_d, as an operator on densities over the surface. tilt_*: the same of the `tilt_kernel`, and of the
-    operator from first moments to radiosity that it makes; None where directions change nothing.
+    """pair: (2, N) vertices of near patches, the first not above the second; near: (L, N) R_d there; patch: (V,) number
+    of a vertex's patch; basis: (L, V, k) values of its patch's k functions; coupling: (L, C k, C k) of the functions of
+    all C patches, nothing between near ones; error: (L,) bounds of the norm of what is left of R_d, as an operator on
+    densities over the surface. tilt_*: the same of the `tilt_kernel`, and of the operator from first moments to
+    radiosity that it makes; None where directions change nothing.
     """
 
     kind: ClassVar[str] = "factorised"
 
     pair: Annotated[I64, Axes("end pair", "1", kind="i")]
     near: Annotated[F32, Axes("laser pair", "mm^-2")]
+    patch: Annotated[I64, Axes("vertex", "1", kind="i")]
     basis: Annotated[F32, Axes("laser vertex rank", "1")]
-    weight: Annotated[F32, Axes("laser rank", "mm^-2")]
+    coupling: Annotated[F32, Axes(_MODES, "mm^-2")]
     error: Annotated[F64, Axes("laser", "1")]
     tilt_near: Annotated[F32 | None, Axes("laser pair", "mm^-3")] = None
-    tilt_basis: Annotated[F32 | None, Axes("laser vertex tilted", "1")] = None
-    tilt_weight: Annotated[F32 | None, Axes("laser tilted", "mm^-3")] = None
+    tilt_coupling: Annotated[F32 | None, Axes(_MODES, "mm^-3")] = None
     tilt_error: Annotated[F64 | None, Axes("laser", "1")] = None
 
     @property
@@ -65,53 +90,48 @@ class FactorisedTerm(RadiosityTerm):
         return self.tilt_near is not None
 
     def check(self, lasers: int, vertices: int) -> None:
-        """Raises: ValueError as every term, and for pairs of vertices that are not there."""
+        """Raises: ValueError as every term, and for pairs of vertices or patches that are not there."""
         super().check(lasers, vertices)
-        parts = [self.tilt_near, self.tilt_basis, self.tilt_weight, self.tilt_error]
+        parts = [self.tilt_near, self.tilt_coupling, self.tilt_error]
         if len({part is None for part in parts}) > 1:
             raise ValueError(f"{self.kind}.tilt: its arrays come together")
         if len(self.pair) != 2 or (self.pair.size and not 0 <= self.pair.min() <= self.pair.max() < vertices):
             raise ValueError(f"{self.kind}.pair: names vertices that are not there")
+        rank, modes = self.basis.shape[2], self.coupling.shape[1]
+        if rank and (modes % rank or not 0 <= self.patch.min() <= self.patch.max() < modes // rank):
+            raise ValueError(f"{self.kind}.patch: names patches that are not there")
 
     @cached_property
     def kernels(self) -> tuple[Kernel, ...]:
         """R_d, by laser."""
-        return self._kernels(self.near, self.basis, self.weight)
+        return self._kernels(self.near, self.coupling)
 
     @cached_property
     def tilt_kernels(self) -> tuple[Kernel, ...]:
         """By laser; none where directions change nothing."""
-        if self.tilt_near is None or self.tilt_basis is None or self.tilt_weight is None:
+        if self.tilt_near is None or self.tilt_coupling is None:
             return ()
-        return self._kernels(self.tilt_near, self.tilt_basis, self.tilt_weight)
+        return self._kernels(self.tilt_near, self.tilt_coupling)
 
-    def _kernels(self, near: F32, basis: F32, weight: F32) -> tuple[Kernel, ...]:
-        first, second = self.pair
-        both = first != second
-        at = np.concatenate([first, second[both]]), np.concatenate([second, first[both]])
-        shape = (basis.shape[1],) * 2
-        entries = (np.concatenate([one, one[both]]) for one in near)
-        return tuple(
-            Kernel(sparse.csr_array((own, at), shape=shape), np.ascontiguousarray(b), w)
-            for own, b, w in zip(entries, basis, weight, strict=True)
-        )
+    def _kernels(self, near: F32, coupling: F32) -> tuple[Kernel, ...]:
+        parts = zip(near, self.basis, coupling, strict=True)
+        return tuple(Kernel(self.pair, n, self.patch, b, c) for n, b, c in parts)
 
     def radiosity(self, flux: F64, points: F64) -> F64:
-        """Lasers side by side: the products leave the interpreter."""
+        """On two threads: the products leave the interpreter."""
         centred = points - points.mean(axis=0)  # less is lost where positions cancel
-
-        def one(laser: int) -> F64:
-            own = flux[:, laser]
-            radiosity = self.kernels[laser](own[:1])
-            if not self.tilt_kernels:
-                return radiosity
-            out = gathered(self.tilt_kernels[laser](placed(own, centred)), centred)
-            out[0] += radiosity[0]
-            return out
-
-        _ = self.kernels, self.tilt_kernels  # not by two threads at once
+        jobs = [(kernel, flux[:1, laser]) for laser, kernel in enumerate(self.kernels)]
+        for laser, kernel in enumerate(self.tilt_kernels):
+            jobs += [(kernel, half) for half in np.split(placed(flux[:, laser], centred), 2)]
         with ThreadPoolExecutor(max_workers=2) as threads:
-            return np.stack(list(threads.map(one, range(self.lasers))), axis=1)
+            products = list(threads.map(lambda job: job[0](job[1]), jobs))
+        radiosity, halves = np.stack(products[: self.lasers], axis=1), products[self.lasers :]
+        if not halves:
+            return radiosity
+        moved = zip(halves[::2], halves[1::2], strict=True)
+        out = np.stack([gathered(np.concatenate(pair), centred) for pair in moved], axis=1)
+        out[0] += radiosity[0]
+        return out
 
     def error_bound(self, flux: F64, area: F64) -> F64:
         """(1 or 4, L) the most that `radiosity` can be off, as rms over the surface in W/mm^2: of the radiosity, and of
@@ -126,7 +146,7 @@ class FactorisedTerm(RadiosityTerm):
 
     def reflectance_columns(self, vertices: Sequence[int] | I64) -> ReflectanceColumns:
         """Columns of the product; which entries were measured is no longer known."""
-        unit = np.zeros((len(vertices), self.basis.shape[1]))
+        unit = np.zeros((len(vertices), len(self.patch)))
         unit[np.arange(len(vertices)), vertices] = 1.0
         mean = np.stack([kernel(unit) for kernel in self.kernels])
         return ReflectanceColumns(mean, None, np.zeros(unit.shape, bool))

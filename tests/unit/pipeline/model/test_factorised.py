@@ -16,7 +16,7 @@ from hw.base.errors import InputError
 from pipeline.geometry.camera import PinholeCamera, look_at
 from pipeline.geometry.fresnel import Boundary
 from pipeline.geometry.mesh import RayMesh
-from pipeline.model.factorise import Truncation, factorised, near_pairs
+from pipeline.model.factorise import Truncation, factorised, near_patches, patches
 from pipeline.model.factorised import FactorisedTerm
 from pipeline.model.lambertian import LambertianTerm
 from pipeline.model.reflectance import GlobalTerm
@@ -26,7 +26,7 @@ from pipeline.model.tilt import TiltLaw, tilt_kernel
 from pipeline.relight.lights import Directional
 from pipeline.relight.on_mesh import LightOnMesh, ViewOfMesh
 
-CUT = Truncation(near=40, rank=60, tilt_rank=30)
+CUT = Truncation(near=60, patch=10, rank=5)
 
 
 def dense(tilted: bool = True, lasers: int = 2) -> RelightableModel:
@@ -71,16 +71,22 @@ def off(flux: F64) -> F64:
     return np.sqrt((error**2 * AREA).sum(axis=2) / AREA.sum())
 
 
-def test_near_entries_are_exact_and_far_ones_near() -> None:
-    columns = np.arange(0, len(AREA), 7)
-    pair, exact = near_pairs(POINTS, CUT.near), MODEL.reflectance_columns(columns)
-    product = FAST.reflectance_columns(columns)
+def test_near_entries_are_exact_and_far_ones_held_to_their_own_size() -> None:
+    centred = POINTS - POINTS.mean(axis=0)  # as they are rounded there: the ball has many equal gaps
+    columns, patch = np.arange(0, len(AREA), 7), patches(centred, CUT.patch)
+    assert 0.7 * CUT.patch < np.bincount(patch).min() <= np.bincount(patch).max() <= CUT.patch
+    close, pair = near_patches(centred, patch, CUT.near)
     near = np.zeros((len(AREA),) * 2, bool)
     near[pair[0], pair[1]] = near[pair[1], pair[0]] = True
-    assert near.sum(axis=1).mean() == pytest.approx(CUT.near, rel=0.2)
-    error = np.abs(product.mean - exact.mean) / exact.mean.max()
+    assert 0.5 * CUT.near < near.sum(axis=1).mean() <= CUT.near
+    np.testing.assert_array_equal(near, close[patch][:, patch])
+    distance = cdist(POINTS, POINTS)
+    assert near[distance < 2.5].all()
+    error = np.abs(FAST.reflectance_columns(columns).mean / MODEL.reflectance_columns(columns).mean - 1)
     assert error[:, near[columns]].max() < 1e-6
-    assert 1e-6 < error.max() < 0.02  # single entries have errors of 5 %, which no smooth part follows
+    assert 0.005 < np.median(error[:, ~near[columns]]) < 0.05  # entries' own errors are 4 %
+    dark = distance[columns] > 16
+    assert np.median(error[:, dark]) < 0.05
 
 
 def test_the_bound_is_above_the_norm_of_what_is_left_and_not_far_above() -> None:
@@ -131,7 +137,7 @@ def test_lit_images_agree() -> None:
 
 
 def test_all_ranks_leave_nothing() -> None:
-    whole = factorised(dense(tilted=False), Truncation(near=1, rank=162))
+    whole = factorised(dense(tilted=False), Truncation(near=1, patch=8, rank=8))
     assert not fast_term(whole).by_direction
     flux = np.random.default_rng(1).standard_normal((1, 2, 162))
     exact = dense(tilted=False).terms[0].radiosity(flux, POINTS)  # type: ignore[attr-defined]
@@ -149,11 +155,13 @@ def test_a_lambertian_surface_is_a_diagonal() -> None:
 def test_files_hold_factorised_models(tmp_path: Path) -> None:
     FAST.save(tmp_path / "fast.npz")
     again = fast_term(RelightableModel.load(tmp_path / "fast.npz").of_lasers([1, 0]))
-    np.testing.assert_array_equal(again.tilt_basis[1], fast_term(FAST).tilt_basis[0])  # type: ignore[index]
+    np.testing.assert_array_equal(again.basis[1], fast_term(FAST).basis[0])
     assert factorised(FAST).terms == FAST.terms
     bad = replace(fast_term(FAST), pair=fast_term(FAST).pair + 1)
-    with pytest.raises(ValueError, match="not there"):
+    with pytest.raises(ValueError, match="vertices that are not there"):
         replace(FAST, terms=(bad,))
+    with pytest.raises(ValueError, match="patches that are not there"):
+        replace(FAST, terms=(replace(fast_term(FAST), patch=fast_term(FAST).patch + 1),))
     with pytest.raises(ValueError, match="come together"):
         replace(FAST, terms=(replace(fast_term(FAST), tilt_error=None),))
 
