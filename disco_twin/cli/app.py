@@ -169,12 +169,12 @@ def reference(scene: SceneFile, out: RunOut, profile: ProfileOption = "full") ->
     """Render the reference images of a scene into DIR, one EXR per light and held-out view."""
     from disco_twin.experiment.experiment import Experiment
     from disco_twin.experiment.references import render_references, shipped_references
-    from disco_twin.run.progress import stage_bar
+    from disco_twin.run.progress import screen_log, stage_bar
     from disco_twin.run.scan import require_capturable
     from disco_twin.scene.scene import load_scene
 
     loaded = load_scene(scene, profile)
-    with naming(scene), stage_bar(console, "references", "lights") as report:
+    with naming(scene), screen_log(console), stage_bar(console, "references", "lights") as report:
         experiment = Experiment(loaded)
         require_capturable(experiment)
         lights = render_references(experiment, shipped_references(scene, loaded.name), out, report)
@@ -240,10 +240,11 @@ def plan(scene: SceneFile, profile: ProfileOption = "full") -> None:
     from disco_twin.experiment.experiment import Experiment
     from disco_twin.experiment.references import shipped_references
     from disco_twin.run.cost_prediction import predict
+    from disco_twin.run.progress import screen_log
     from disco_twin.run.scan import require_capturable
     from disco_twin.scene.scene import load_scene
 
-    with naming(scene):
+    with naming(scene), screen_log(console):
         experiment = Experiment(load_scene(scene, profile))
         require_capturable(experiment)
         lines = predict(experiment, shipped_references(scene, experiment.scene.name))

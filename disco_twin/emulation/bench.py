@@ -45,7 +45,8 @@ class Bench:
         config = twin.config
         if config.projector.steps > STEPS:
             problem, key = "more mirror steps than the emulated board's DAC has", "rig.projector.steps"
-            raise InputError(problem, key=key, value=config.projector.steps, allowed=f"at most {STEPS}")
+            raise InputError(problem, key=key, value=config.projector.steps, allowed=f"at most {STEPS}",
+                             remedy="fewer steps, or a capture by the twin")  # fmt: skip
         self.twin, self.clock = twin, clock
         self.heads = [LaserHead(laser.wavelength_nm, laser.power_mw) for laser in config.lasers]
         for index, head in enumerate(self.heads):

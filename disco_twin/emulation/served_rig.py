@@ -26,11 +26,11 @@ class Darkness:
 
     def image(self, camera: int, aim: Aim, laser: int) -> F32:
         """Nothing looks. Raises: DiscoError."""
-        raise DiscoError("these emulated devices have no camera")
+        raise DiscoError("these emulated devices have no camera. Remedy: a rig file with a simulated one")
 
     def silhouette(self, camera: int, angle: int) -> F32:
         """Nothing looks. Raises: DiscoError."""
-        raise DiscoError("these emulated devices have no camera")
+        raise DiscoError("these emulated devices have no camera. Remedy: a rig file with a simulated one")
 
 
 def emulated_devices(scene: TwinRigConfig, seed: int) -> Emulation:

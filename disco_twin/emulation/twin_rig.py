@@ -122,13 +122,15 @@ class TwinRig(Rig):
     def require_power(self) -> None:
         """Refuse to do anything outside `with rig:`. Raises: Refused."""
         if not self.powered:
-            raise Refused("the rig is switched off: use it inside `with rig:`")
+            raise Refused("the rig is switched off. Remedy: use it inside `with rig:`")
 
     def require_dark(self, what: str) -> None:
         """Refuse to move anything while laser light is let out. Raises: Refused."""
         self.require_power()
         if self.scene.gate >= 0:
-            raise Refused(f"the {what} must not move while the gate of laser {self.scene.gate} is open")
+            raise Refused(
+                f"the {what} must not move while the gate of laser {self.scene.gate} is open. Remedy: shut it first"
+            )
 
     def repeats(self, camera: int) -> int:
         """How many exposures in a row, before the one that is due, this camera has made of the unchanged scene."""
@@ -154,7 +156,9 @@ class TwinLaser:
         """Let light out; refused while another gate is open. Raises: Refused."""
         self.rig.require_power()
         if self.rig.scene.gate not in (-1, self.index):
-            raise Refused(f"the gate of laser {self.rig.scene.gate} is open: one laser at a time")
+            raise Refused(
+                f"the gate of laser {self.rig.scene.gate} is open: one laser at a time. Remedy: shut it first"
+            )
         self.rig.alter(gate=self.index)
 
     def close_gate(self) -> None:
@@ -179,7 +183,8 @@ class TwinProjector:
         steps = self.rig.config.projector.steps
         for name, value in (("u", u), ("v", v)):
             if not 0 <= value < steps:
-                raise InputError("no such mirror step", key=name, value=value, allowed=f"0 to {steps - 1}")
+                raise InputError("no such mirror step", key=name, value=value, allowed=f"0 to {steps - 1}",
+                                 remedy="aim at another one")  # fmt: skip
         self.rig.alter(u=int(u), v=int(v))
 
 
@@ -199,7 +204,8 @@ class TwinTurntable:
             value = round(float(np.rad2deg(angle_rad)), 6)
             allowed = ", ".join(f"{a:g}" for a in self.rig.config.turntable_angles_deg)
             problem = "the twin has no light for this turntable angle"
-            raise InputError(problem, key="angle_deg", value=value, allowed=allowed)
+            remedy = "turn to one of these"
+            raise InputError(problem, key="angle_deg", value=value, allowed=allowed, remedy=remedy)
         if nearest != self.rig.scene.angle:
             self.rig.clock += TURN_S
         self.rig.alter(angle=nearest)
@@ -236,7 +242,8 @@ class TwinTargetHolder:
         """Exchange the target, if it is not there yet. Raises: InputError."""
         self.rig.require_dark("target")
         if not 0 <= angle_rad < self.placements or angle_rad != int(angle_rad):
-            raise InputError("no such target", key="placement", value=angle_rad, allowed=f"0 to {self.placements - 1}")
+            raise InputError("no such target", key="placement", value=angle_rad, allowed=f"0 to {self.placements - 1}",
+                             remedy="place one of these")  # fmt: skip
         if int(angle_rad) != self.rig.scene.angle:
             self.rig.clock += EXCHANGE_S
         self.rig.alter(angle=int(angle_rad))

@@ -17,9 +17,9 @@ from disco_twin.evaluate.columns import score_columns
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.object_pixels import ObjectPixels
 from disco_twin.experiment.pipeline_process import load_results
-from disco_twin.experiment.references import reference_path
+from disco_twin.experiment.references import read_reference, reference_path
 from disco_twin.experiment.run_folder import RunFolder
-from disco_twin.light.references import HALVES, LAYERS, load_reference
+from disco_twin.light.references import HALVES, LAYERS
 from disco_twin.light.truth import Truth
 from disco_twin.scene.scene import Scene
 from hw.base.arrays import Bool
@@ -172,7 +172,7 @@ class OpenedRun:
         """Mitsuba's images in two independent halves; a model of R_d answers for the layer `subsurface`."""
         self._finished("references")
         lights, views, folder = self.scene.relight.lights, self.scene.relight.views, self.folder.twin / "references"
-        loaded = [[load_reference(reference_path(folder, light, view)).halves for view in views] for light in lights]
+        loaded = [[read_reference(reference_path(folder, light, view)).halves for view in views] for light in lights]
         names = {"half": list(HALVES), "layer": list(LAYERS)}
         stacked = np.moveaxis(_stacked(loaded), (2, 3), (0, 1))
         return _array(stacked, "half layer light view laser row column", RADIANCE, **names, **self._relit_names)

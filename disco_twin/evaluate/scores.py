@@ -15,9 +15,9 @@ import numpy as np
 from disco_twin.evaluate.columns import score_columns
 from disco_twin.evaluate.z_scores import ZScores, z_of_pixels
 from disco_twin.experiment.experiment import Experiment
-from disco_twin.experiment.references import load_outside_reference, reference_path
+from disco_twin.experiment.references import load_outside_reference, read_reference, reference_path
 from disco_twin.experiment.run_folder import RunFolder
-from disco_twin.light.references import LAYERS, load_reference
+from disco_twin.light.references import LAYERS
 from hw.base.arrays import F32, F64, Bool
 from hw.base.config import Strict, read_json
 from hw.base.errors import InputError
@@ -139,7 +139,7 @@ def usable_score(what: str, image: F32, a: F32, b: F32, mask: Bool) -> dict[str,
 
 def reference_halves(folder: RunFolder, light: Light, view: CameraConfig) -> F32:
     """(2, L, H, W) both halves of a reference, W/(mm^2 sr): the light from below the surface, which R_d answers for."""
-    return load_reference(reference_path(folder.twin / "references", light, view)).halves[:, LAYERS.index("subsurface")]
+    return read_reference(reference_path(folder.twin / "references", light, view)).halves[:, LAYERS.index("subsurface")]
 
 
 def outside_halves(experiment: Experiment, folder: RunFolder, light: Light, view: CameraConfig) -> F32 | None:

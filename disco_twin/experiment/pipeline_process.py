@@ -69,7 +69,10 @@ def reconstruct_apart(
         if status == -signal.SIGKILL:
             remedy = "a scan of fewer vertices (scan.vertices), fewer methods, or a machine with more memory"
             raise PipelineFailed(f"{folder.capture}: the pipeline was killed, most likely for memory. Remedy: {remedy}")
-        raise PipelineFailed(why if status == 2 else f"the pipeline failed: {why} (see {folder.work / 'pipeline.log'})")
+        if status == 2:
+            raise PipelineFailed(why)
+        remedy = f"see {folder.work / 'pipeline.log'}, and report it with that file"
+        raise PipelineFailed(f"the pipeline failed: {why}. Remedy: {remedy}")
     if kept:
         _keep(scene, folder, before, kept)
     return max(row.peak_mb for row in load_results(folder).stages)

@@ -7,13 +7,18 @@ the ordinary ones. A few scenes ship some (benchmarks/volpath_references.py make
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.keys import content_key
-from disco_twin.light.references import Reference, load_reference, save_reference
+from disco_twin.light.references import RENDER_AGAIN, Reference, load_reference, save_reference
 from hw.base.errors import InputError
 from hw.base.files import write_atomically
 from pipeline.geometry.camera import PinholeCamera
@@ -36,6 +41,36 @@ def reference_key(scene: Scene, light: Light, view: CameraConfig) -> str:
 def reference_path(folder: Path, light: Light, view: CameraConfig) -> Path:
     """Where the reference of a light and view lies in a folder of references."""
     return folder / f"{light.name}@{view.name}.exr"
+
+
+def read_reference(path: Path) -> Reference:
+    """A reference; the EXR library's own lines on the screen are dropped, our message says the same in one.
+
+    Raises: InputError where it is missing or damaged, or was saved by another program, which keeps what it knows.
+    """
+    try:
+        with _quiet():
+            found = load_reference(path)
+    except (KeyError, ValueError, TypeError) as error:
+        problem = "was saved by another program: it lacks what ours writes"
+        raise InputError(problem, file=path, remedy=RENDER_AGAIN) from error
+    if found.halves.ndim != 5 or not np.isfinite(found.halves).all():
+        raise InputError("was saved by another program: its channels differ", file=path, remedy=RENDER_AGAIN)
+    return found
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Nothing that a library of C writes to the screen is shown in this block."""
+    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
+        sys.stderr.flush()
+        kept = os.dup(2)
+        os.dup2(nowhere.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
 
 
 def shipped_references(scene_file: Path, name: str) -> Path:
@@ -61,7 +96,7 @@ def load_outside_reference(folder: Path, scene: Scene, light: Light, view: Camer
     if not path.is_file():
         return None
     try:
-        found = load_reference(path)
+        found = read_reference(path)
     except InputError as error:
         log.warning("%s", error.amended(remedy="delete it, or take it again from where the scene came from"))
         return None
@@ -86,12 +121,16 @@ def holds_reference(folder: Path, experiment: Experiment, light: Light, view: Ca
     if not path.is_file():
         return False
     try:
-        found = load_reference(path)
+        found = read_reference(path)
     except InputError as error:
-        log.warning("%s", error)
+        log.warning("%s; another one is rendered", error.amended(remedy=None))
         return False
-    wanted = experiment.scene.simulation.reference_noise
-    return found.key == reference_key(experiment.scene, light, view) and found.noise <= wanted
+    scene, wanted = experiment.scene, experiment.scene.simulation.reference_noise
+    if found.halves.shape[2:] != (len(scene.rig.lasers), view.height, view.width):
+        shape = " x ".join(map(str, found.halves.shape[2:]))
+        log.warning("%s: is of %s lasers, rows and columns; another one is rendered", path, shape)
+        return False
+    return found.key == reference_key(scene, light, view) and found.noise <= wanted
 
 
 def render_references(experiment: Experiment, shipped: Path, own: Path, progress: Progress) -> int:

@@ -179,7 +179,9 @@ class RunFolder:
         return alone_in(self.root, DiscoError(f"{problem}. Remedy: wait for it, or choose another --out"))
 
     def _load(self) -> None:
-        data = read_json(self.journal, _Journal, "choose another --out")
+        other = "read it with the version that wrote it, or choose another --out"
+        anew = f"disco-twin run SCENE --out {self.root} begins it anew, and looks at every stage again"
+        data = read_json(self.journal, _Journal, other if _of_another_version(self.journal) else anew)
         self.identity = data.identity
         self.stages = {record.name: record for record in data.stages}
 
@@ -215,7 +217,7 @@ def _of_another_version(journal: Path) -> bool:
     """Whether the journal can be read, and is of another format version."""
     try:
         return bool(json.loads(journal.read_bytes()).get("format_version", FORMAT_VERSION) != FORMAT_VERSION)
-    except (ValueError, AttributeError):
+    except (OSError, ValueError, AttributeError):
         return False
 
 

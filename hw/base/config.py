@@ -157,6 +157,14 @@ def read_json(path: Path, schema: type[T], remedy: str) -> T:
         raise InputError("is damaged (it is no JSON)", file=path, remedy=remedy) from error
 
 
+def in_words(error: Exception) -> str:
+    """What an error of a library says, in one line; of a schema's, the first problem alone."""
+    if isinstance(error, ValidationError):
+        first = error.errors(include_url=False)[0]
+        return ": ".join([*(str(part) for part in first["loc"]), first["msg"].removeprefix("Value error, ")])
+    return " ".join(str(error).split())
+
+
 def check(data: dict[str, Any], schema: type[M], path: str | Path) -> M:
     """Validate parsed TOML; `path` is the file it came from, for messages and relative file names."""
     try:

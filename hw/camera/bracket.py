@@ -39,10 +39,12 @@ class Bracket:
         ascending = tuple(sorted(set(self.exponents)))
         if not ascending or self.exponents != ascending or ascending[0] != 0 or ascending[-1] > 23:
             allowed = "ascending from 0, at most 23"
-            raise InputError("not a bracket", key="exponents", value=self.exponents, allowed=allowed)
+            raise InputError("not a bracket", key="exponents", value=self.exponents, allowed=allowed,
+                             remedy="name every exposure once, the longest first")  # fmt: skip
         if not 0 < self.saturation_dn <= self.full_scale_dn:
             problem, allowed = f"not on the scale of {self.bits} bits", f"1 to {self.full_scale_dn}"
-            raise InputError(problem, key="saturation_dn", value=self.saturation_dn, allowed=allowed)
+            remedy = "correct saturation_dn or bits"
+            raise InputError(problem, key="saturation_dn", value=self.saturation_dn, allowed=allowed, remedy=remedy)
 
     @property
     def full_scale_dn(self) -> int:

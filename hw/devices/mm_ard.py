@@ -134,7 +134,13 @@ class MirrorBoard:
         """
         for channel, (name, value) in enumerate((("u", u), ("v", v))):
             if not 0 <= value < STEPS:
-                raise InputError("no such mirror step", key=name, value=value, allowed=f"0 to {STEPS - 1}")
+                raise InputError(
+                    "no such mirror step",
+                    key=name,
+                    value=value,
+                    allowed=f"0 to {STEPS - 1}",
+                    remedy="aim at another one",
+                )
             command = bytes([SET_DAC, channel, value >> 8, value & 0xFF])
             self._exchange(command, command)
 
@@ -147,7 +153,12 @@ class MirrorBoard:
         Raises: DeviceRefused where the board does not follow.
         """
         if not 0 <= pattern < 1 << LINES:
-            raise InputError("no such pattern of TTL lines", value=pattern, allowed=f"0 to {(1 << LINES) - 1}")
+            raise InputError(
+                "no such pattern of TTL lines",
+                value=pattern,
+                allowed=f"0 to {(1 << LINES) - 1}",
+                remedy="set these lines alone",
+            )
         if self._owed and not pattern:
             self.darken()  # getting back into step takes a second
         for _ in range(ATTEMPTS):
@@ -181,7 +192,7 @@ class MirrorBoard:
         Raises: InputError.
         """
         if not 0 <= pin < PINS:
-            raise InputError("no such analogue pin", value=pin, allowed=f"0 to {PINS - 1}")
+            raise InputError("no such analogue pin", value=pin, allowed=f"0 to {PINS - 1}", remedy="read one of these")
         return sorted(self._sample(pin) for _ in range(3))[1]
 
     def _sample(self, pin: int) -> int:

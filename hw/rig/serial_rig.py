@@ -142,7 +142,10 @@ class SerialRig(Rig):
         Raises: DeviceFault; Refused while a gate is open.
         """
         if self.open_gate >= 0:
-            raise Refused(f"the lasers are checked in the dark, and the gate of laser {self.open_gate} is open")
+            raise Refused(
+                f"the lasers are checked in the dark, and the gate of laser {self.open_gate} is open. Remedy: shut it "
+                "first"
+            )
         return check_lasers(self.file, self.board(), dict(enumerate(self.drivers().lasers)))
 
     @property
@@ -165,12 +168,14 @@ class SerialRig(Rig):
         """Refuse to move anything while laser light is let out. Raises: Refused."""
         self.drivers()
         if self.open_gate >= 0:
-            raise Refused(f"the {what} must not move while the gate of laser {self.open_gate} is open")
+            raise Refused(
+                f"the {what} must not move while the gate of laser {self.open_gate} is open. Remedy: shut it first"
+            )
 
 
 def _in_use(device: T | None) -> T:
     if device is None:
-        raise Refused("the rig is switched off: use it inside `with rig:`")
+        raise Refused("the rig is switched off. Remedy: use it inside `with rig:`")
     return device
 
 
@@ -189,7 +194,7 @@ class GatedLaser:
         """Let light out; refused while another gate is open. Raises: Refused, DeviceError."""
         self.rig.require_guards()
         if self.rig.open_gate not in (-1, self.index):
-            raise Refused(f"the gate of laser {self.rig.open_gate} is open: one laser at a time")
+            raise Refused(f"the gate of laser {self.rig.open_gate} is open: one laser at a time. Remedy: shut it first")
         self.rig.last_open = self.index
         self.rig.board().open_gate(self.rig.file.lasers[self.index].gate_line)
 

@@ -211,7 +211,8 @@ def _pose_of(points: F64, board: F64, lens: F64, nominal: PinholeCamera) -> F64:
     matrix, distortion = _matrices(lens, nominal)
     ok, rotation, shift = cv2.solvePnP(board, points - 0.5, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
     if not ok:
-        raise DiscoError("a chessboard's pose cannot be found from its corners")
+        raise DiscoError("a chessboard's pose cannot be found from its corners. Remedy: photograph the board again, "
+                         "all of it in sight")  # fmt: skip
     return np.concatenate([rotation.ravel(), shift.ravel()]).astype(np.float64)
 
 

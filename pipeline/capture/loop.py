@@ -64,9 +64,11 @@ def capture(rig: Rig, plan: Plan, folder: Path, progress: Progress | None = None
 def _require_match(rig: Rig, plan: Plan) -> None:
     names = tuple(camera.name for camera in rig.cameras)
     if names != plan.cameras:
-        raise InputError("the plan is for other cameras", key="cameras", value=names, allowed=str(plan.cameras))
+        raise InputError("the plan is for other cameras", key="cameras", value=names, allowed=str(plan.cameras),
+                         remedy="name the rig's cameras as the plan does")  # fmt: skip
     if len(rig.lasers) != plan.lasers:
-        raise InputError("the plan is for other lasers", key="lasers", value=len(rig.lasers), allowed=str(plan.lasers))
+        raise InputError("the plan is for other lasers", key="lasers", value=len(rig.lasers), allowed=str(plan.lasers),
+                         remedy="use the rig that the plan was made for")  # fmt: skip
 
 
 def _sweep(rig: Rig, stream: StreamWriter, progress: Progress | None) -> None:

@@ -123,7 +123,8 @@ def _shoot(rig: Rig, stored: StreamReader, address: ImageAddress) -> tuple[RawIm
         raw = rig.cameras[plan.camera_of(address.view)].expose()
         power = rig.photodiode.read()
     if not power > 0:
-        raise RigMoved(f"no laser light: the photodiode reads {power:g} W where it read {meta.photodiode_w:g} W")
+        raise RigMoved(f"no laser light: the photodiode reads {power:g} W where it read {meta.photodiode_w:g} W. "
+                       "Remedy: see to the laser, its gate and fibre, and repeat the same command")  # fmt: skip
     return raw, power
 
 

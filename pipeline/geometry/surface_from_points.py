@@ -25,7 +25,8 @@ def reconstruct_surface(points: F64, normals: F64, vertices: int) -> trimesh.Tri
     Raises: InputError for too few points, or points that no closed surface follows.
     """
     if len(points) < LEAST_POINTS:
-        raise InputError("too few points", key="points", value=len(points), allowed=f"at least {LEAST_POINTS}")
+        raise InputError("too few points", key="points", value=len(points), allowed=f"at least {LEAST_POINTS}",
+                         remedy="scan more of the object")  # fmt: skip
     v, f = gpytoolbox.point_cloud_to_mesh(
         points.astype(np.float64), normals.astype(np.float64), psr_screening_weight=SCREENING, psr_depth=PSR_DEPTH
     )

@@ -12,6 +12,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from hw.base.arrays import F32, F64
+from hw.base.config import in_words
 from hw.base.errors import InputError
 from hw.base.files import load_arrays, save_arrays
 from pipeline.geometry.camera import PinholeCamera
@@ -161,7 +162,7 @@ class RelightableModel:
             boundary = Boundary(float(b["eta"]), tuple(b["cosines"]), tuple(b["ratio"]))
             return cls(mesh, boundary, terms, head["provenance"])
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise InputError(f"is damaged, or no model ({error})", file=path, remedy=REMEDY) from error
+            raise InputError(f"is damaged, or no model ({in_words(error)})", file=path, remedy=REMEDY) from error
 
 
 def _same(one: trimesh.Trimesh, other: trimesh.Trimesh) -> bool:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from hw.base.config import Strict, read_json
+from hw.base.config import Strict, in_words, read_json
 from hw.base.errors import InputError
 from hw.interface import Aim
 from pipeline.geometry.nominal_rig import RigConfig
@@ -158,7 +158,7 @@ def load_plan(path: Path) -> Plan:
     try:
         return Plan(file.cameras, file.angles_rad, tuple(Aim(*spot) for spot in file.spots), file.lasers)
     except ValueError as error:
-        raise InputError(f"is damaged ({error})", file=path, remedy=remedy) from error
+        raise InputError(f"is damaged ({in_words(error)})", file=path, remedy=remedy) from error
 
 
 def make_plan(rig: RigConfig, mesh: trimesh.Trimesh) -> Plan:

@@ -67,7 +67,9 @@ class StreamWriter:
 
     def _lock(self, folder: Path) -> None:
         if not take_lock(self._files.images):
-            raise DiscoError(f"{folder}: another process is capturing into this folder")
+            raise DiscoError(
+                f"{folder}: another process is capturing into this folder. Remedy: wait for it, or choose another"
+            )
 
     def _claim(self, folder: Path) -> None:
         """Make sure that the folder is this plan's; a header or plan.json that was damaged is written anew."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from hw.base.config import in_words
 from hw.base.errors import InputError
 from hw.base.files import load_arrays, save_arrays
 from pipeline.geometry.camera import PinholeCamera
@@ -71,7 +72,7 @@ def load_samples(path: Path) -> Samples:
             **own,
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"is damaged ({error})", file=path, remedy=remedy) from error
+        raise InputError(f"is damaged ({in_words(error)})", file=path, remedy=remedy) from error
 
 
 def _lobe(alphas: list[float], strengths: list[float], error: float, because: str) -> SurfaceLobe:

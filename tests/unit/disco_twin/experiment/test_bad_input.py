@@ -19,7 +19,13 @@ from scene_texts import GOOD
 from disco_twin.evaluate.scores import load_relit, load_scores
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.pipeline_process import load_results, pipeline_inputs, stale
-from disco_twin.experiment.references import render_references
+from disco_twin.experiment.references import (
+    holds_reference,
+    read_reference,
+    reference_key,
+    reference_path,
+    render_references,
+)
 from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.light.references import Reference, load_reference, save_reference
 from disco_twin.light.truth import Truth
@@ -270,6 +276,37 @@ def test_references_that_are_gone_or_damaged(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         render_references(sphere(), tmp_path, path, lambda done, total: None)
     one_line(caught, str(path), "is not a folder", "another --out")
+
+
+@pytest.mark.parametrize("change", ["rgb", "no noise", "cut", "size"])
+def test_references_that_other_programs_saved(
+    change: str, tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """One line of ours, none of the EXR library; a reference of the wrong size is rendered again, too."""
+    experiment = sphere()
+    light, view = experiment.scene.relight.lights[0], experiment.scene.relight.views[0]
+    path = reference_path(tmp_path, light, view)
+    rows = view.height // (2 if change == "size" else 1)
+    halves = np.random.default_rng(0).random((2, 2, 3, rows, view.width)).astype(np.float32)
+    key = reference_key(experiment.scene, light, view)
+    save_reference(path, Reference(halves, 1e-3, key))
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        header, channels = dict(file.header()), {name: channel.pixels for name, channel in file.channels().items()}
+    if change == "rgb":
+        OpenEXR.File(header, dict(zip("RGB", channels.values(), strict=False))).write(str(path))
+    elif change == "no noise":
+        OpenEXR.File({k: v for k, v in header.items() if k != "noise"}, channels).write(str(path))
+    elif change == "cut":
+        path.write_bytes(path.read_bytes()[:-400])
+    assert not holds_reference(tmp_path, experiment, light, view)
+    assert [record.getMessage().endswith("another one is rendered") for record in caplog.records] == [True]
+    assert capfd.readouterr() == ("", "")
+    if change != "size":
+        with pytest.raises(InputError) as caught:
+            read_reference(path)
+        one_line(caught, str(path), "Remedy: delete it, disco-twin run renders it again")
+    save_reference(path, Reference(np.ones((2, 2, 3, view.height, view.width), np.float32), 1e-3, key))
+    assert holds_reference(tmp_path, experiment, light, view)
 
 
 def test_a_reference_is_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

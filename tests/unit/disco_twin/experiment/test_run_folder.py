@@ -165,3 +165,19 @@ def test_a_folder_that_was_moved_holds_what_its_scene_names(tmp_path: Path) -> N
     assert identity(found) == moved.identity
     assert build_object(found).mesh.volume == pytest.approx(trimesh.creation.icosphere(2, 20).volume, rel=1e-5)
     assert found.relight == scene.relight and found.rig == scene.rig
+
+
+@pytest.mark.parametrize(
+    ("content", "remedy"),
+    [
+        ("{", "disco-twin run SCENE --out {} begins it anew"),
+        ('{"format_version": 2, "identity": 3, "stages": []}', "disco-twin run SCENE --out {} begins it anew"),
+        ('{"format_version": 1}', "read it with the version that wrote it, or choose another --out"),
+    ],
+)
+def test_a_journal_that_cannot_be_read_names_what_helps(tmp_path: Path, scene: Path, content: str, remedy: str) -> None:
+    folder = RunFolder.claim(tmp_path / "out", scene, "one")
+    folder.journal.write_text(content)
+    with pytest.raises(InputError) as caught:
+        RunFolder.open(folder.root)
+    assert str(folder.journal) in str(caught.value) and remedy.format(folder.root) in str(caught.value)
