@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 STYLE = Path(__file__).with_name("templates") / "figures.mplstyle"
 
 INK, FAINT, TRUTH = "#22272e", "#c9cdd3", "#22272e"
-SPARE = ("#8a5a9e", "#b5534f", "#3d8f8f", "#7a6f3a")
+SPARE = ("#cc79a7", "#d55e00", "#56b4e9", "#6b5b00")
+MARKERS, DASHES = "oDs^vP", ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (6, 1.5, 1.5, 1.5)))  # beside colour: for print
 DIFFERENCE_SPAN = 0.2  # the difference's colour scale runs to +- this share of the reference's 99th percentile
 
 
@@ -28,6 +29,11 @@ def colour(method: str) -> str:
     """A method's colour is the same in every figure."""
     known = known_methods().get(method)
     return (known and known.colour) or SPARE[sum(map(ord, method)) % len(SPARE)]
+
+
+def marker(place: int) -> str:
+    """Of the method in this place of a legend."""
+    return MARKERS[place % len(MARKERS)]
 
 
 def new_figure(width: float, height: float, **subplots: Any) -> tuple[Figure, Any]:
@@ -80,10 +86,13 @@ class Comparison:
 
 
 def comparison_figure(rows: Sequence[Comparison], shown: Sequence[str]) -> Figure:
-    """One light: for each view the relit images, the reference and the differences, with scale bars."""
+    """One light: for each view the relit images, the reference and the differences, with scale bars and the radiance
+    that is white; as far as there is an object.
+    """
     columns = len(shown) * 2 + 1
     figure, axes = new_figure(3.3 * columns, 2.2 * len(rows), nrows=len(rows), ncols=columns, squeeze=False)
-    for line, row in zip(axes, rows, strict=True):
+    for line, whole in zip(axes, rows, strict=True):
+        row = cropped(whole)
         lasers, height, _ = row.reference.shape
         exposure = float(np.percentile(row.reference[:, row.mask], 99)) if row.mask.any() else 1.0
         exposure = exposure if exposure > 0 else 1.0
@@ -92,7 +101,10 @@ def comparison_figure(rows: Sequence[Comparison], shown: Sequence[str]) -> Figur
             axis.imshow(tone(image, exposure, lasers), interpolation="nearest")
             note = f", nrmse {row.nrmse[name]:.3f}" if name in row.nrmse else ""
             axis.set_title(f"{row.view}: {name}{note}", loc="left", fontsize=8)
-        scale_bar(line[0], row.mm_per_pixel, height)
+            scale_bar(axis, row.mm_per_pixel, height)
+        line[len(pictures) - 1].set_title(
+            f"{row.view}: reference, white {exposure:.2g} W/(mm² sr)", loc="left", fontsize=8
+        )
         for axis, name in zip(line[len(pictures) :], shown, strict=True):
             difference = np.where(row.mask, (row.relit[name] - row.reference).mean(axis=0) / exposure, np.nan)
             drawn = axis.imshow(difference, cmap="RdBu_r", vmin=-DIFFERENCE_SPAN, vmax=DIFFERENCE_SPAN)
@@ -104,6 +116,19 @@ def comparison_figure(rows: Sequence[Comparison], shown: Sequence[str]) -> Figur
         bar.ax.tick_params(labelsize=7)
         bar.outline.set_visible(False)
     return figure
+
+
+def cropped(row: Comparison, margin: int = 4) -> Comparison:
+    """The part that shows the object, with some pixels around it; all of it where nothing does."""
+    y, x = np.nonzero(row.mask)
+    if not len(y):
+        return row
+    window = (
+        slice(max(0, y.min() - margin), y.max() + margin + 1),
+        slice(max(0, x.min() - margin), x.max() + margin + 1),
+    )
+    relit = {name: image[:, *window] for name, image in row.relit.items()}
+    return replace(row, reference=row.reference[:, *window], relit=relit, mask=row.mask[window])
 
 
 @dataclass(frozen=True)
@@ -130,7 +155,7 @@ def impulse_figure(impulses: Sequence[Sequence[Impulse]]) -> Figure:
             drawn = axis.imshow(np.maximum(impulse.radiance, floor), norm=norm, cmap="magma")
             axis.set_title(f"spot {impulse.spot}, {impulse.camera}", loc="left", fontsize=8)
             plain(axis)
-        scale_bar(line[0], row[0].mm_per_pixel, row[0].radiance.shape[0])
+            scale_bar(axis, impulse.mm_per_pixel, impulse.radiance.shape[0])
     bar = figure.colorbar(drawn, ax=axes, fraction=0.02, pad=0.01)
     bar.set_label("radiance per watt, 1/(mm² sr)")
     bar.outline.set_visible(False)
@@ -147,12 +172,15 @@ def light_error_figure(relit: Sequence[Mapping[str, Any]], methods: Sequence[str
     """nrmse of every method for every light, both views; log scale."""
     lights = list(dict.fromkeys(str(r["light"]) for r in relit))
     figure, axis = new_figure(7.2, 0.36 * len(lights) + 1.0)
-    for offset, method in zip(np.linspace(-0.24, 0.24, max(len(methods), 2)), methods, strict=False):
+    for place, (offset, method) in enumerate(
+        zip(np.linspace(-0.24, 0.24, max(len(methods), 2)), methods, strict=False)
+    ):
         rows = [r for r in relit if r["method"] == method and r["nrmse"] is not None]
         x = np.array([max(float(r["nrmse"]), 1e-3) for r in rows])
         y = np.array([lights.index(r["light"]) for r in rows]) + offset
         error = np.array([float(r["nrmse_se"]) for r in rows])
-        axis.errorbar(x, y, xerr=np.minimum(error, 0.95 * x), fmt="o", ms=5, color=colour(method), lw=1, label=method)
+        low = np.minimum(error, 0.95 * x)
+        axis.errorbar(x, y, xerr=low, fmt=marker(place), ms=5, color=colour(method), lw=1, label=method)
     axis.set_xscale("log")
     label_log_axis(axis.xaxis)
     axis.set_yticks(range(len(lights)), lights)
@@ -166,8 +194,8 @@ def light_error_figure(relit: Sequence[Mapping[str, Any]], methods: Sequence[str
 def pareto_figure(points: Mapping[str, tuple[float, float]]) -> Figure:
     """Error against time: per method (seconds, rms of nrmse over lights and views)."""
     figure, axis = new_figure(5.0, 3.0)
-    for method, (seconds, error) in points.items():
-        axis.plot(max(seconds, 1e-2), error, "o", ms=9, color=colour(method), label=method)
+    for place, (method, (seconds, error)) in enumerate(points.items()):
+        axis.plot(max(seconds, 1e-2), error, marker(place), ms=9, color=colour(method), label=method)
     axis.set_xscale("log")
     axis.set_yscale("log")
     for side in (axis.xaxis, axis.yaxis):
@@ -193,7 +221,7 @@ def reflectance_figure(
     centres = (edges[:-1] + edges[1:]) / 2
     peak = float(truth.max())
     for laser, axis in enumerate(axes[0]):
-        for name, values in {"truth": truth, **models}.items():
+        for place, (name, values) in enumerate({"truth": truth, **models}.items()):
             stats = np.full((3, bins), np.nan)
             for b in range(bins):
                 inside = values[laser].ravel()[which == b]
@@ -201,7 +229,8 @@ def reflectance_figure(
                 if inside.size >= 5:
                     stats[:, b] = np.percentile(inside, [10, 50, 90])
             ink = TRUTH if name == "truth" else colour(name)
-            axis.plot(centres, stats[1], color=ink, lw=1.8 if name == "truth" else 1.4, label=name)
+            dash = DASHES[place % len(DASHES)]
+            axis.plot(centres, stats[1], color=ink, lw=1.8 if name == "truth" else 1.4, ls=dash, label=name)
             if name in ("truth", next(iter(models), "")):
                 axis.fill_between(centres, np.maximum(stats[0], peak * 1e-9), stats[2], color=ink, alpha=0.12, lw=0)
         axis.set_yscale("log")
@@ -226,7 +255,8 @@ def decade_figure(rmse: Mapping[str, Mapping[str, float | None]], coverage: Mapp
         heights = [np.nan if (v := values.get(d)) is None else max(v, 0.0) for d in decades]
         ink, shade = colour(method.split(",")[0]), 0.5 if "," in method else 1.0
         at = x + (n - (len(rmse) - 1) / 2) * width
-        left.bar(at, heights, width * 0.92, color=ink, alpha=shade, label=method)
+        hatch = "///" if "," in method else None
+        left.bar(at, heights, width * 0.92, color=ink, alpha=shade, hatch=hatch, ec="w", lw=0, label=method)
     left.set_ylabel("log10 rmse of $R_d$")
     left.legend(ncols=2)
     left.margins(y=0.25)
@@ -264,13 +294,21 @@ def balance_figure(balance: Mapping[str, Sequence[float]], wavelengths_nm: Seque
     figure, axis = new_figure(7.2, 0.42 * len(wavelengths_nm) + 1.1)
     y = np.arange(len(wavelengths_nm))
     left = np.zeros(len(y))
-    inks = ("#1f6391", "#7fb0d0", "#cf8a2e", "#8d93a0", "#b5534f", "#5f9472", "#8a5a9e")
+    inks = ("#0a4c86", "#56b4e9", "#e6a117", "#9aa0a8", "#d55e00", "#00845f", "#cc79a7")
     for n, (term, values) in enumerate(balance.items()):
         shares = np.asarray(values, float)
-        axis.barh(y, shares, 0.62, left=left, color=inks[n % len(inks)], label=term)
+        axis.barh(y, shares, 0.62, left=left, color=inks[n % len(inks)], ec="w", label=term)
         for at, start, share in zip(y, left, shares, strict=True):
             if share > 0.06:
-                axis.text(start + share / 2, at, f"{100 * share:.1f} %", ha="center", va="center", color="w", size=8)
+                axis.text(
+                    start + share / 2,
+                    at,
+                    f"{100 * share:.1f} %",
+                    ha="center",
+                    va="center",
+                    color="w" if n != 1 else "k",
+                    size=8,
+                )
         left += shares
     axis.set_yticks(y, [f"{w:g} nm" for w in wavelengths_nm])
     axis.set_ylim(len(y) - 0.5, -0.5)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from PIL import Image
 
 from disco_twin.evaluate.summary import figure_or_dash, pooled, rms
 from disco_twin.report import figures
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 
 Summary = Mapping[str, Any]
 
+DPI = 170
+CONTENTS = "[contents]"  # where the links to the sections go, once it is known which there are
 BROAD = ("uniform", "directional", "environment")
 
 
@@ -59,12 +63,13 @@ def write_report(data: ReportData, path: Path) -> None:
 
 
 def render(data: ReportData) -> str:
-    """The page as HTML: `templates/report.html.j2`, with the figures embedded as PNG."""
+    """The page as HTML: `templates/report.html.j2`, with the figures embedded."""
     loader = PackageLoader("disco_twin.report")
     page = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     page.filters |= {
         "width": page_width,
-        "png": png,
+        "picture": picture,
+        "anchor": anchor,
         "three_digits": figure_or_dash,
         "duration": duration,
         "with_error": with_error,
@@ -72,7 +77,8 @@ def render(data: ReportData) -> str:
     relit = data.summary["relit"]
     methods = list(dict.fromkeys(str(row["method"]) for row in relit))
     errors = {method: pooled(relit, method) for method in methods}
-    return page.get_template("report.html.j2").render(
+    whole = page.get_template("report.html.j2").render(
+        contents=CONTENTS,
         data=data,
         summary=data.summary,
         figures=figures,
@@ -84,6 +90,13 @@ def render(data: ReportData) -> str:
         decades=decade_bars(data),
         z_rows=z_rows(data.summary.get("z") or {}),
     )
+    links = (f'<a href="#{name}">{title}</a>' for name, title in re.findall(r'<h2 id="([^"]+)">(.*?)</h2>', whole))
+    return whole.replace(CONTENTS, " ".join(links))
+
+
+def anchor(title: str) -> str:
+    """A heading's name in links."""
+    return re.sub(r"[^a-z]+", "-", title.lower()).strip("-")
 
 
 def light_row(relit: Sequence[Summary], light: str, methods: Sequence[str], main: str) -> dict[str, Any]:
@@ -130,11 +143,19 @@ def page_width(figure: Figure) -> int:
     return round(float(figure.get_figwidth()) * 100)
 
 
-def png(figure: Figure) -> str:
-    """A figure as a PNG of nearly twice the page's resolution, in base64."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=170, metadata={"Software": None})
-    return base64.b64encode(buffer.getvalue()).decode()
+def picture(figure: Figure, photograph: bool = False) -> str:
+    """A figure as a data URI, of nearly twice the page's resolution. photograph: of images, whose shades no palette
+    holds; they are compressed as such.
+    """
+    buffer, shown = io.BytesIO(), io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+    image = Image.open(buffer).convert("RGB")
+    if photograph:
+        image.save(shown, "WEBP", quality=82, method=4)
+    else:
+        image.quantize(64, dither=Image.Dither.NONE).save(shown, "PNG", optimize=True)
+    kind = "webp" if photograph else "png"
+    return f"data:image/{kind};base64,{base64.b64encode(shown.getvalue()).decode()}"
 
 
 def duration(seconds: float) -> str:

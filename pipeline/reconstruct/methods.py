@@ -26,7 +26,7 @@ def reconstruct(samples: Samples, name: str) -> RelightableModel:
     return replace(model, provenance={"method": name} | dict(model.provenance))
 
 
-@method("default", about="the completed matrix of R_d with the measured boundary", colour="#1f6391")
+@method("default", about="the completed matrix of R_d with the measured boundary", colour="#0a4c86")
 def reconstruct_default(samples: Samples) -> RelightableModel:
     """Samples -> model. An opaque object has no global term: all its light leaves within an edge of where it enters."""
     return fit_lambertian(samples) if is_opaque(samples) else complete(samples)

@@ -68,7 +68,7 @@ def fit_dipole_laser(samples: Samples, laser: int) -> tuple[float, float]:
     return float(scattering), float(absorption)
 
 
-@method("dipole", about="a homogeneous half-space (Jensen et al. 2001)", baseline=True, colour="#5f9472")
+@method("dipole", about="a homogeneous half-space (Jensen et al. 2001)", baseline=True, colour="#00845f")
 def fit_dipole(samples: Samples) -> RelightableModel:
     """The baseline: samples -> model. Its kernel depends on distance alone."""
     found = [fit_dipole_laser(samples, laser) for laser in range(len(samples.values))]

@@ -79,7 +79,7 @@ def fill(values: F64, known: Bool, laplacian: sparse.csr_array) -> F64:
     return np.asarray(np.where(fixed, start, np.maximum(half * filled.reshape(half.shape), 0.0)), np.float64)
 
 
-@method("disco2004", about="resampling and filling of the thesis (5.3)", reads="bilinear", colour="#cf8a2e")
+@method("disco2004", about="resampling and filling of the thesis (5.3)", reads="bilinear", colour="#e6a117")
 def resample_2004(samples: Samples) -> RelightableModel:
     """The baseline: samples (read by bilinear look-up) -> model. R_d in mm^-2 per laser."""
     laplacian = neighbours(np.asarray(samples.mesh.vertices), np.asarray(samples.mesh.edges_unique))

@@ -35,7 +35,7 @@ def spot_energies(samples: Samples, laser: int) -> F64:
     return np.where(enough, seen * whole / np.maximum(expected, 1e-12), np.nan)
 
 
-@method("lambertian", about="an opaque surface of one albedo a vertex", baseline=True, colour="#8d93a0")
+@method("lambertian", about="an opaque surface of one albedo a vertex", baseline=True, colour="#9aa0a8")
 def fit_lambertian(samples: Samples) -> RelightableModel:
     """The baseline: samples -> model. The albedo is kriged between the spots (Rasmussen & Williams 2006,
     eq. 2.25).

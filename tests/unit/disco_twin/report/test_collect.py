@@ -50,7 +50,7 @@ def test_the_report_and_the_table_show_a_dash_where_there_is_no_score() -> None:
     data = replace(data, summary={**data.summary, "relit": rows}, impulses=(), comparisons=(), distance=None)
     page = render(data)
     assert "<tr><td>edge</td>" + "<td>-</td>" * len(METHODS) + "<td>- / -</td><td>-</td>\n<td>-</td></tr>" in page
-    assert "nan" not in page.split("<h2>Errors</h2>")[1].split("<figure>")[0]
+    assert "nan" not in page.split(">Errors</h2>")[1].split("<figure>")[0]
     page = render(replace(data, summary={**data.summary, "relit": [r | dict.fromkeys(KEPT) for r in rows]}))
     assert "<b>-</b><span>nrmse under broad light" in page
     out = StringIO()

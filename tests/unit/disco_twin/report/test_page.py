@@ -12,13 +12,19 @@ import pytest
 from report_fakes import LIGHTS, fake_data
 
 from disco_twin.evaluate.summary import rms
+from disco_twin.report.figures import TRUTH, colour, marker
 from disco_twin.report.page import ReportData, render, write_report
+from hw.base.arrays import F64
 
 
 def test_the_page_is_self_contained_and_complete(tmp_path: Path) -> None:
     write_report(fake_data(), tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
-    assert not re.findall(r"(?:src|href)=['\"](?!data:)|https?://|url\(|<script", page)
+    assert not re.findall(r"(?:src|href)=['\"](?!data:|#|view\.html)|https?://|url\(|<script", page)
+    linked, headed = re.findall(r'href="#([^"]+)"', page), re.findall(r'<h2 id="([^"]+)"', page)
+    assert linked == headed == sorted(set(headed), key=headed.index)
+    order = ["impulse-responses", "relit-images", "errors", "diffuse-subsurface-reflectance"]
+    assert headed[:4] == order  # captures, relit beside reference, curves and tables
     for light in LIGHTS:
         assert f"<h3>{light}</h3>" in page
     for heading in (
@@ -39,7 +45,31 @@ def test_the_page_is_self_contained_and_complete(tmp_path: Path) -> None:
     assert "<td>totals of lit columns</td><td>independent</td><td>60</td><td>12.00</td>" in page
     assert "quick &lt;&amp;&gt;" in page
     assert "<deviation>" not in page
-    assert len(page) < 12e6
+    assert len(page) < 3e6
+
+
+def seen_as(rgb: F64, kind: str) -> F64:
+    """L, a, b of colours as a dichromat sees them (Machado, Oliveira, Fernandes 2009, table 1, severity 1)."""
+    matrix = {
+        "all": np.eye(3),
+        "protan": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+        "deutan": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    }[kind]
+    linear = np.clip(np.where(rgb > 0.04045, ((rgb + 0.055) / 1.055) ** 2.4, rgb / 12.92) @ np.transpose(matrix), 0, 1)
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    x, y, z = np.cbrt(linear @ to_xyz.T / [0.9505, 1.0, 1.089]).T
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
+
+
+@pytest.mark.parametrize("kind", ["all", "protan", "deutan"])
+def test_methods_are_told_apart_by_colour_and_in_print_by_marks(kind: str) -> None:
+    """Every two colours differ by 15 in CIELAB (one is the least that eyes see), white and the truth's ink included."""
+    names = ["#ffffff", TRUTH, *(colour(name) for name in ("default", "disco2004", "dipole", "lambertian"))]
+    rgb = np.array([[int(name[n : n + 2], 16) / 255 for n in (1, 3, 5)] for name in names])
+    lab = seen_as(rgb, kind)
+    apart = np.linalg.norm(lab[:, None] - lab, axis=-1)[np.triu_indices(len(lab), 1)]
+    assert apart.min() > 15
+    assert len({marker(place) for place in range(4)}) == 4
 
 
 def test_errors_against_outside_references_are_shown_where_there_are_some() -> None:
@@ -49,7 +79,7 @@ def test_errors_against_outside_references_are_shown_where_there_are_some() -> N
     outside = {"volpath_nrmse": 0.123, "volpath_nrmse_se": 0.004}
     rows = [row | (outside if row["light"] == light else {}) for row in data.summary["relit"]]
     page = render(replace(data, summary={**data.summary, "relit": rows}))
-    table = page.split("<h2>Errors</h2>")[1].split("</table>")[0]
+    table = page.split(">Errors</h2>")[1].split("</table>")[0]
     assert "<th>volpath, default</th>" in table
     lines = {row.split("</td>")[0].removeprefix("<td>"): row for row in table.replace("\n", "").split("<tr>")}
     assert lines[light].count("<td>0.123</td></tr>") == 1
@@ -140,7 +170,7 @@ def calibration_section(found: dict[str, Any]) -> str:
     """The calibration's section of a page that shows little else."""
     summary = {**fake_data().summary, "relit": [], "calibration": found}
     page = render(ReportData(summary=summary, wavelengths_nm=[635.0], main="default"))
-    return page.split("<h2>Calibration</h2>")[1].split("</section>")[0]
+    return page.split(">Calibration</h2>")[1].split("</section>")[0]
 
 
 def test_a_measured_calibration_is_shown_with_its_uncertainty() -> None:
