@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import os
 import platform
 import re
 import shutil
@@ -95,5 +96,9 @@ def _machine() -> Finding:
 
 def _disk(folder: Path) -> Finding:
     there = next(p for p in (folder.resolve(), *folder.resolve().parents) if p.exists())
+    if not os.access(there, os.W_OK | os.X_OK):
+        return Finding(
+            "disk", False, f"{there} cannot be written to", "change into another folder, or name another --out"
+        )
     free = shutil.disk_usage(there).free / 1024**3
     return Finding("disk", free >= DISK_GB, f"{free:.1f} GiB free at {there}", f"free {DISK_GB:g} GiB")

@@ -22,7 +22,7 @@ from hw.base.files import require_folder, write_atomically
 from hw.rig.rig_file import EMULATED, DevicesFile
 from hw.rig.rig_rules import load_rig_file
 from pipeline.capture.loop import capture
-from pipeline.capture.poses import pose_warnings
+from pipeline.capture.poses import pose_warnings, watching
 from pipeline.capture.rig_fits_scene import require_reach, require_same, require_scene
 from pipeline.stream.files import IMAGES
 from pipeline.stream.stream import StreamReader
@@ -89,7 +89,8 @@ def capture_with_devices(run: Run, path: Path, logs: Path | None, *, armed: bool
 
     def take_images(report: Report) -> None:
         with naming(path), open_scene_rig(file, run.scene.rig, _twin(run, file), logs, armed=armed) as rig:
-            capture(rig, experiment.plan, folder.capture, report, sensor)
+            watched = watching(folder.capture, experiment.plan, report)
+            capture(rig, experiment.plan, folder.capture, watched, sensor)
 
     run.stage("capture", key, take_images, "images")
     for warning in pose_warnings(folder.capture):

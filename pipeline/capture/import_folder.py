@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,6 +118,9 @@ def _require_claimable(out: Path) -> ImportRecord | None:
     """What an earlier import left; None for a folder that is empty or not there. Raises: InputError for any other."""
     if out.exists() and not out.is_dir():
         raise InputError("is not a folder", file=out, remedy=ANOTHER)
+    there = next(path for path in (out, *out.absolute().parents) if path.exists())
+    if not os.access(there, os.W_OK | os.X_OK):  # before hours of reading
+        raise InputError("cannot be written to", file=there, remedy=ANOTHER)
     if not (out / RECORD).is_file():
         held = [path for path in out.iterdir() if path.name != f"{RECORD}.part"] if out.is_dir() else []
         if held:

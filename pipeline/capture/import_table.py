@@ -94,6 +94,8 @@ def _row(path: Path, line: int, row: dict[Any, Any], described: CaptureDescripti
         raise InputError(f"line {line} has more values than columns", file=path, remedy=remedy)
     if not row["file"]:
         raise wrong("file", "a file's name")
+    if "\\" in row["file"] and not (path.parent / row["file"]).exists():
+        raise wrong("file", "folders separated by /")
     names = [camera.name for camera in rig.cameras]
     if row["camera"] not in names:
         raise wrong("camera", ", ".join(names))

@@ -85,9 +85,12 @@ class SilhouetteFit:
             f"the silhouettes of camera {', '.join(self.cameras)} do not show the scan at the stated poses: they "
             f"overlap it by {self.stated:.2f}, in view {where} by {low:.2f} (right poses: {self.least:.2f} and more)"
         )
+        others = self.others
         if self.cause is not None:
             text += f"; likeliest cause: {self.cause[0]}"
-        return text + "; overlaps with " + ", ".join(f"{name} {value:.2f}" for name, value, _ in self.others)
+        else:
+            text, others = f"{text}; no simple slip explains them", others[:3]
+        return text + "; overlaps with " + ", ".join(f"{name} {value:.2f}" for name, value, _ in others)
 
     @property
     def remedy(self) -> str:
@@ -179,14 +182,16 @@ AS_IT_IS: Rows = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 @dataclass(frozen=True)
 class Slip:
-    """What people get wrong. rows, columns: whether the frames are to be flipped along them; sign, offset_deg: of the
-    angles; axes: (3, 3) stated frame of the scan -> the right one; exchanged: two cameras.
+    """What people get wrong. rows, columns: whether the frames are to be flipped along them; dark: whether the object
+    is darker than what is behind it; sign, offset_deg: of the angles; axes: (3, 3) stated frame of the scan -> the
+    right one; exchanged: two cameras.
     """
 
     name: str
     remedy: str
     rows: bool = False
     columns: bool = False
+    dark: bool = False
     sign: int = 1
     offset_deg: float = 0.0
     axes: Rows = AS_IT_IS
@@ -194,7 +199,7 @@ class Slip:
 
     def flipped(self, mask: Bool) -> Bool:
         """A silhouette as it should have been delivered."""
-        return np.asarray(mask[:: -1 if self.rows else 1, :: -1 if self.columns else 1])
+        return np.asarray(mask[:: -1 if self.rows else 1, :: -1 if self.columns else 1] != self.dark)
 
     def camera(self, rig: RigConfig, view: int) -> PinholeCamera:
         """The camera that a view was really taken by."""
@@ -215,6 +220,7 @@ FRAMES = (
     Slip("mirrored frames", "switch mirroring off in the camera's driver, or mirror them back left to right",
          columns=True),
     Slip("upside-down frames", "switch flipping off in the driver, or exchange their top and bottom", rows=True),
+    Slip("dark silhouettes", "light the object, not what is behind it", dark=True),
     Slip("frames turned by 180 deg", "turn them back, or negate the camera's up", rows=True, columns=True),
 )  # fmt: skip
 POSES = (

@@ -15,7 +15,7 @@ from PIL import Image
 
 from hw.base.errors import InputError
 from pipeline.capture.import_folder import import_capture, read_frame
-from pipeline.capture.poses import pose_warnings
+from pipeline.capture.poses import pose_warnings, watching
 from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.run import Request, run
 from pipeline.stream.stream import StreamReader
@@ -80,6 +80,13 @@ def two_stops(capture: ForeignCapture) -> None:
         capture.frames[low + 1].picture = np.rint(64 + light.clip(-8) / 4 + (light < 9)).astype(np.uint16)
 
 
+def backlit(capture: ForeignCapture) -> None:
+    for frame in capture.frames:
+        if frame.row["kind"] == "silhouette":
+            white = 2400.0 * float(str(frame.row["exposure_s"])) / 0.02
+            frame.picture = np.rint(64 + white - (frame.picture - 64.0)).astype(np.uint16)
+
+
 def shifted_up(capture: ForeignCapture) -> None:
     described("bits = 12", "bits = 16")(capture)
     described("saturation_dn = 3900", "saturation_dn = 62400")(capture)
@@ -114,6 +121,7 @@ def other_way(capture: ForeignCapture) -> None:
         (lambda c: c.rows(lambda r: {"power_w": r["power_w"] and 10.1}), "power_w = '10.1'.*1.01e.03 times.*to watts"),
         (every(lambda p: p[:, ::-1]), "likeliest cause: mirrored frames; overlaps with mirrored frames 0.9"),
         (every(lambda p: p[::-1]), "likeliest cause: upside-down frames"),
+        (backlit, "likeliest cause: dark silhouettes"),
         (every(lambda p: p[::-1, ::-1]), "likeliest cause: frames turned by 180 deg"),
         (other_way, "likeliest cause: a turntable that turns the other way"),
         (lambda c: c.rows(lambda r: {"u": r["u"] and 4095 - r["u"]}), "likeliest cause: u counts the other way"),
@@ -133,17 +141,26 @@ def test_contradictions_are_refused_before_anything_is_stored(
     assert not (tmp_path / "x").exists()
 
 
-def test_poses_that_do_not_fit_are_never_silent(right: ForeignCapture, tmp_path: Path) -> None:
+def test_poses_that_do_not_fit_are_never_silent(
+    right: ForeignCapture, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """A capture that is there already, whose table is then said to turn the other way: a warning, also of a run."""
     capture = tmp_path / "x"
-    import_capture(right.write(tmp_path / "theirs"), capture)
+    plan = import_capture(right.write(tmp_path / "theirs"), capture)
     rig = (capture / "rig.json").read_text()
     assert "40.0" in rig and "100.0" in rig
     (capture / "rig.json").write_text(
         rig.replace(" 40.0", " -40.0").replace("[40.0", "[-40.0").replace("100.0", "-100.0")
     )
+    steps: list[int] = []
+    watch = watching(capture, plan, lambda done, total: steps.append(done))
     cause = "likeliest cause: a turntable that turns the other way"
     assert [cause in line for line in pose_warnings(capture)] == [True]
+    with caplog.at_level(logging.WARNING):
+        for done in range(1, len(plan) + 1):
+            watch(done, len(plan))
+    assert steps == list(range(1, len(plan) + 1))
+    assert [cause in record.getMessage() for record in caplog.records] == [True]
     request = Request(format_version=1, reconstruct=ReconstructConfig(methods=("lambertian",)))
     assert cause in run(capture, tmp_path / "work", request)["warnings"][0]
 
