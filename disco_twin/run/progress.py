@@ -37,14 +37,31 @@ class SpeedColumn(ProgressColumn):
         return Text("" if speed is None else f"{speed:.3g} {self.unit}/s", style="dim")
 
 
+class WholeColumn(ProgressColumn):
+    """How much longer the whole run takes. whole: from the seconds that are left of this stage, None if not known."""
+
+    def __init__(self, whole: Callable[[float | None], str]) -> None:
+        super().__init__()
+        self.whole = whole
+
+    def render(self, task: Task) -> Text:
+        """As the stage's own speed has it, too."""
+        return Text(self.whole(task.time_remaining), style="dim")
+
+
 @contextmanager
-def stage_bar(console: Console, name: str, unit: str) -> Iterator[Report]:
-    """A progress bar for a stage; gone when the stage has ended. Nothing where there is no terminal to draw it on."""
+def stage_bar(
+    console: Console, name: str, unit: str, whole: Callable[[float | None], str] | None = None
+) -> Iterator[Report]:
+    """A progress bar for a stage; gone when the stage has ended. Nothing where there is no terminal to draw it on.
+
+    whole: what the bar says of the whole run, from the seconds that are left of this stage
+    """
     if not console.is_terminal:
         yield lambda done, total: None
         return
     plain = not console.encoding.lower().startswith("utf")
-    columns = (
+    columns: tuple[ProgressColumn, ...] = (
         SpinnerColumn("line" if plain else "dots"),
         TextColumn("{task.description:<12}"),
         BarColumn(bar_width=None),
@@ -53,6 +70,7 @@ def stage_bar(console: Console, name: str, unit: str) -> Iterator[Report]:
         TimeElapsedColumn(),
         TextColumn("left", style="dim"),
         TimeRemainingColumn(),
+        *(() if whole is None else (WholeColumn(whole),)),
     )
     with Progress(*columns, console=console, transient=True, redirect_stdout=False, redirect_stderr=False) as progress:
         task = progress.add_task(name, total=None)

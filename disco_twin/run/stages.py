@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,16 @@ from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.keys import code_key, content_key, identity
 from disco_twin.experiment.omissions import left_out_by_the_twin
 from disco_twin.experiment.pipeline_process import load_results, pipeline_inputs, reconstruct_apart, stale
-from disco_twin.experiment.references import outside_folder, reference_key, render_references, shipped_references
+from disco_twin.experiment.references import (
+    outside_folder,
+    reference_key,
+    reference_path,
+    render_references,
+    shipped_references,
+)
 from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.run.progress import Report, run_log, stage_bar
+from disco_twin.run.time_left import TimeLeft, in_words
 from disco_twin.scene.scene import Profile, Scene, load_scene
 from hw.base.errors import InputError, refused_by_the_disk
 from hw.base.files import write_atomically, write_json
@@ -74,6 +82,7 @@ class Run:
     scene_file: Path
     methods: tuple[str, ...]
     console: Console
+    time_left: TimeLeft | None = None  # of a whole run
 
     @property
     def scene(self) -> Scene:
@@ -92,8 +101,16 @@ class Run:
         Raises: Interrupted at Ctrl-C, DiscoError where the disk refuses, and what `work` raises.
         """
 
+        left, start = self.time_left, time.perf_counter()
+
+        def whole(of_it: float | None) -> str:
+            assert left is not None
+            if of_it is None:
+                of_it = max(left.pace * left.expected[name] - (time.perf_counter() - start), 0.0)
+            return f"whole {in_words(left.seconds(name, of_it))}"
+
         def watched() -> float | None:
-            with stage_bar(self.console, name, unit) as report:
+            with stage_bar(self.console, name, unit, None if left is None else whole) as report:
                 peak = work(report)
             return peak if isinstance(peak, float) else None
 
@@ -105,6 +122,9 @@ class Run:
             raise refused_by_the_disk(error, self.folder.root) or error from error
         record = self.folder.stages[name]
         note = f"{record.seconds:8.1f} s {record.peak_mb:8.0f} MiB" if done else "finished before"
+        if left is not None:
+            left.finished(name, time.perf_counter() - start if done else None)
+            note += f"   about {in_words(seconds)} left" if done and (seconds := left.seconds()) > 5 else ""
         self.console.print(f"  {name:<12} {note}", highlight=False)
 
 
@@ -288,6 +308,14 @@ def stage_rows(folder: RunFolder, parts: Sequence[StageFigures]) -> list[dict[st
 
 def run_all(run: Run) -> dict[str, Any]:
     """Everything, from the scan to the report. Raises: what the stages raise."""
+    shipped, relight, made = shipped_references(run.scene_file, run.scene.name), run.scene.relight, run.folder.twin
+    places = (shipped, made / "references")
+    missing = [
+        light
+        for light in relight.lights
+        if not all(any(reference_path(at, light, view).is_file() for at in places) for view in relight.views)
+    ]
+    run = replace(run, time_left=TimeLeft(run.scene, len(missing)))
     with run_log(run.folder.root / "run.log", run.console):
         capture_stages(run)
         truth_stages(run)

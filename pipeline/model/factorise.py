@@ -42,7 +42,7 @@ class Truncation:
     @classmethod
     def of(cls, vertices: int) -> Truncation:
         """What serves a mesh of this size."""
-        return cls() if vertices <= LARGE else cls(224, 32, 8)
+        return cls() if vertices <= LARGE else cls(224, 32, 6)
 
 
 def factorised(model: RelightableModel, truncation: Truncation | None = None) -> RelightableModel:

@@ -52,15 +52,34 @@ class Kernel:
 
     def __call__(self, vectors: F64) -> F64:
         """(n, V) products with the rows of (n, V)."""
-        padded = np.zeros((self._patches * self._size, len(vectors)), np.float32)
-        padded[self._slot] = vectors.T
-        columns = padded.reshape(self._patches, self._size, -1)
-        out = np.add.reduceat(self._blocks @ columns[self._column], self._starts, axis=0)
-        if len(self.coupling):
-            entering = self._basis.swapaxes(1, 2) @ columns
-            leaving = self.coupling @ entering.reshape(-1, len(vectors))
-            out += self._basis @ leaving.reshape(entering.shape)
-        return np.asarray(out.reshape(len(padded), -1)[self._slot].T, np.float64)
+        columns = self.padded(vectors)
+        return self.gathered([self.half(columns, n) for n in range(2)])
+
+    def padded(self, vectors: F64) -> F32:
+        """(C, size, n) by patch, from (n, V)."""
+        out = np.zeros((self._patches * self._size, len(vectors)), np.float32)
+        out[self._slot] = vectors.T
+        return out.reshape(self._patches, self._size, -1)
+
+    def half(self, columns: F32, number: int) -> F32:
+        """First or second half of the patches of the product with what `padded` returns: both can be done at once."""
+        middle, rank = self._patches // 2, self._basis.shape[2]
+        own = slice(0, middle) if number == 0 else slice(middle, self._patches)
+        starts = self._starts[own]
+        if not len(starts):
+            return columns[own]
+        blocks = slice(starts[0], len(self._blocks) if number else self._starts[middle])
+        out = np.add.reduceat(self._blocks[blocks] @ columns[self._column[blocks]], starts - starts[0], axis=0)
+        if rank:
+            entering = (self._basis.swapaxes(1, 2) @ columns).reshape(self._patches * rank, -1)
+            leaving = self.coupling[own.start * rank : own.stop * rank] @ entering
+            out += self._basis[own] @ leaving.reshape(len(starts), rank, -1)
+        return np.asarray(out)
+
+    def gathered(self, halves: Sequence[F32]) -> F64:
+        """(n, V) from both halves."""
+        out = np.concatenate(halves).reshape(self._patches * self._size, -1)
+        return np.asarray(out[self._slot].T, np.float64)
 
 
 @dataclass(frozen=True)
@@ -120,17 +139,19 @@ class FactorisedTerm(RadiosityTerm):
     def radiosity(self, flux: F64, points: F64) -> F64:
         """On two threads: the products leave the interpreter."""
         centred = points - points.mean(axis=0)  # less is lost where positions cancel
-        jobs = [(kernel, flux[:1, laser]) for laser, kernel in enumerate(self.kernels)]
-        for laser, kernel in enumerate(self.tilt_kernels):
-            jobs += [(kernel, half) for half in np.split(placed(flux[:, laser], centred), 2)]
+        kernels = self.kernels + self.tilt_kernels
+        vectors = [flux[:1, laser] for laser in range(self.lasers)]
+        vectors += [placed(flux[:, laser], centred) for laser in range(len(self.tilt_kernels))]
+        columns = [kernel.padded(own) for kernel, own in zip(kernels, vectors, strict=True)]
+        jobs = [(kernel, own, n) for kernel, own in zip(kernels, columns, strict=True) for n in range(2)]
         with ThreadPoolExecutor(max_workers=2) as threads:
-            products = list(threads.map(lambda job: job[0](job[1]), jobs))
-        radiosity, halves = np.stack(products[: self.lasers], axis=1), products[self.lasers :]
-        if not halves:
-            return radiosity
-        moved = zip(halves[::2], halves[1::2], strict=True)
-        out = np.stack([gathered(np.concatenate(pair), centred) for pair in moved], axis=1)
-        out[0] += radiosity[0]
+            halves = list(threads.map(lambda job: job[0].half(*job[1:]), jobs))
+        products = [kernel.gathered(halves[2 * n : 2 * n + 2]) for n, kernel in enumerate(kernels)]
+        out = np.stack(products[: self.lasers], axis=1)
+        if self.tilt_kernels:
+            plain = out[0]
+            out = np.stack([gathered(product, centred) for product in products[self.lasers :]], axis=1)
+            out[0] += plain
         return out
 
     def error_bound(self, flux: F64, area: F64) -> F64:
