@@ -20,6 +20,7 @@ QUICK_S = {
 QUICK_WALKS, QUICK_TRUTH, QUICK_SPOTS, QUICK_VERTICES, QUICK_TARGETS = 300 * 20_000, 24 * 100_000, 300, 1596, 2
 REFERENCE_S = 43.0  # of a light that is not shipped, in two views
 FASTEST, SLOWEST = 0.05, 100.0  # paces that are believed
+LEAST_S = 1.0  # expected of a stage whose pace counts
 
 
 class TimeLeft:
@@ -43,14 +44,14 @@ class TimeLeft:
     def finished(self, name: str, seconds: float | None) -> None:
         """A stage has ended. seconds: None where it was finished before, which tells nothing of the pace."""
         thought = self._open.pop(name, 0.0)
-        if seconds is not None:
+        if seconds is not None and thought >= LEAST_S:
             self._took += seconds
             self._thought += thought
 
     @property
     def pace(self) -> float:
         """Seconds that a stage takes for each that was expected."""
-        if self._thought < 1.0:
+        if not self._thought:
             return 1.0
         return min(max(self._took / self._thought, FASTEST), SLOWEST)
 

@@ -34,10 +34,11 @@ def test_the_pace_is_that_of_what_is_done(scene: Scene) -> None:
     """A machine three times as slow: so is what is to come. What was finished before says nothing."""
     left = TimeLeft(scene)
     left.finished("scan", 0.9)
+    left.finished("references", 200.0)  # shipped ones did not fit: says nothing of the others
     left.finished("targets", None)
     assert left.pace == 1.0
     left.finished("capture", 3 * left.expected["capture"])
-    later = sum(QUICK_S[name] for name in ("references", "pipeline", "scores"))
+    later = sum(QUICK_S[name] for name in ("pipeline", "scores"))
     assert left.pace == pytest.approx(3.0, rel=0.01)
     assert left.seconds("truth", 7.0) == pytest.approx(7.0 + left.pace * later, rel=0.01)
 
