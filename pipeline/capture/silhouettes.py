@@ -8,13 +8,13 @@ The check is as good as the object is irregular: a ball fits whatever the table 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 import trimesh
+from scipy import ndimage
 
 from hw.base.arrays import F64, Bool
 from hw.record import RawImage, Sensor, to_radiance
@@ -27,7 +27,7 @@ from pipeline.stream.stream import CorruptImage, StreamReader
 
 GRID = 96  # pixels each way that are compared
 MOST_VIEWS = 24  # spread over all
-MISSES, EDGE_PX = 0.08, 0.5  # what a pose that may be right lacks of 1: at any size, and by its edge's uncertainty
+MISSES, EDGE_PX = 0.1, 0.25  # what a pose that may be right lacks of 1: at any size, and by the pixels of its edge
 WHOLE = 0.9  # share of an image that the scan fills at most: beyond, no outline is left to compare
 SLACK = 0.35  # of the object's size, that it may lie beside its place while the poses are still to be calibrated
 BETTER = 0.5  # of what an overlap lacks, another explanation may leave at most to be the likeliest
@@ -118,8 +118,9 @@ def nominal_view(rig: RigConfig, view: int) -> PinholeCamera:
 
 
 def least_overlap(mask: Bool) -> float:
-    """Of a pose that may be right, for an object of this size: half a pixel along its edge is open in any case."""
-    return float(1 - MISSES - EDGE_PX / math.sqrt(max(int(np.count_nonzero(mask)), 1) / math.pi))
+    """Of a pose that may be right, for an object of this shape: of the pixels on its edge a part is always open."""
+    edge = np.count_nonzero(mask & ~ndimage.binary_erosion(mask))
+    return float(1 - MISSES - EDGE_PX * edge / max(int(np.count_nonzero(mask)), 1))
 
 
 def chosen_views(plan: Plan) -> list[int]:
