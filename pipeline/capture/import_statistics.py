@@ -83,7 +83,7 @@ class FrameStatistics:
             error = float(np.median([p.black_error_dn for p in told]))
             if abs(black - offset) > error:
                 raise InputError(
-                    f"the brackets' exposures meet at {black:.0f} DN, {abs(black - offset):.0f} "
+                    f"the brackets' exposures meet at {round(black)} DN, {abs(black - offset):.0f} "
                     f"{'below' if black < offset else 'above'} it: that is the black level of these frames", file=file,
                     key="sensor.offset_dn", value=offset,
                     remedy="state that level, or switch off what the camera's software does to it",
