@@ -82,7 +82,7 @@ def run(quick: bool = False) -> dict[str, Any]:
 def ways(transport: Any, light: Any, cameras: list[Any]) -> dict[str, tuple[int, Run]]:
     """Walks a half and the job, of both ways."""
     from disco_twin.light.references import noise_of
-    from disco_twin.light.rendering import alike_from_everywhere, from_light, from_pixels
+    from disco_twin.light.rendering import Sky, from_light, from_pixels
     from disco_twin.light.sources import light_source
     from pipeline.relight.lights import Beam
 
@@ -95,17 +95,16 @@ def ways(transport: Any, light: Any, cameras: list[Any]) -> dict[str, tuple[int,
         assert traced.images is not None
         return np.array([noise_of(traced.images[:, :, c]) ** 2 for c in range(len(cameras))])
 
-    even = light.kind in ("uniform", "environment") and alike_from_everywhere(light)
-    renders = (
-        [from_pixels(transport, light, camera, NOISE, 22) for camera in cameras]
-        if even
-        else [from_light(transport, light, cameras, 22)]
-    )
+    sky = isinstance(light, Sky)
+    renders = [
+        from_pixels(transport, light, camera, NOISE, 22) if sky else from_light(transport, light, camera, 22)
+        for camera in cameras
+    ]
 
     def new(walks: int, turn: int) -> F64:
-        return np.array([noise_of(image) ** 2 for render in renders for image in render(walks, turn)])
+        return np.array([noise_of(render(walks, turn)) ** 2 for render in renders])
 
-    return {"old": (PLAIN, old), "new": (PIXEL if even else LED if isinstance(light, Beam) else EVEN, new)}
+    return {"old": (PLAIN, old), "new": (PIXEL if sky else LED if isinstance(light, Beam) else EVEN, new)}
 
 
 def merged(curves: list[dict[str, Any]]) -> list[dict[str, Any]]:

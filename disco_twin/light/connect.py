@@ -6,9 +6,10 @@ and that of ordinary exits are combined by the balance heuristic (Veach 1997, se
 boundary the connection is straight instead.
 
 For captures an outer step of the walk draws one of its collisions, all alike, which sends one lobe to each camera.
-References are made by *even* connections (docs/decisions/0054): collisions are drawn, and send lobes, in proportion to
-what they promise; lobes are wider towards grazing angles, and a share of them is wide everywhere, lest the tails of
-what the boundary refracts be left to rare and bright exits.
+References are made by *even* connections (docs/decisions/0054, 0136): to one camera, collisions send lobes in
+proportion to what they promise, about the axis of the facet that the lobe meets; lobes are wider towards grazing
+angles, and a share of them is wide everywhere, lest the tails of what the boundary refracts be left to rare and bright
+exits.
 """
 
 from __future__ import annotations
@@ -20,10 +21,21 @@ import mitsuba as mi
 
 from disco_twin.light import MOST_CAMERAS, sampling
 from disco_twin.light.sampling import Rng
-from disco_twin.light.tables import FAR, ROW, Cameras, Images, Sky, Tables, boundary_context, cell_index, medium_at
+from disco_twin.light.tables import (
+    FAR,
+    ROW,
+    Cameras,
+    Images,
+    Sky,
+    Tables,
+    boundary_context,
+    cell_index,
+    medium_at,
+)
 
-CONNECTIONS = 2.0  # even ones that a collision right below the surface sends, in the mean
-LEAST = 0.05  # of that are sent from as deep as `Tables.reach`
+CONNECTIONS = 2.0  # even ones that an isotropic collision right below a surface sends along its normal, in the mean
+LEAST, MOST = 0.05, 4.0  # times that a collision sends, whatever it promises
+GRAZING = 0.1  # cosine: what leaves at smaller ones promises as much
 SHARPER = 1.25  # concentration of a lobe along the normal, beside that of captures
 WIDE, WIDER = 0.2, 10.0  # share of the lobes that are so many times less concentrated
 
@@ -48,19 +60,25 @@ def refracted_axis(t: Tables, normal: Any, towards: Any) -> Any:
 
 def lobe_at(t: Tables, q: Any, target: Any) -> tuple[Any, Any, Any]:
     """Axis and concentration of the lobe at collision q towards `target`, and whether it is used there."""
-    index = cell_index(t, q)
-    normal = dr.gather(mi.Vector3f, t.normal, index)
+    normal = dr.gather(mi.Vector3f, t.normal, cell_index(t, q))
     towards = dr.normalize(target - q)
     outside = dr.dot(normal, towards)
     usable = (outside > -0.1) & (dr.squared_norm(normal) > 0.5)
-    kappa = t.kappa
-    if t.even and t.eta > 1.0:
+    if not t.even:
+        return refracted_axis(t, normal, towards), t.kappa, usable
+    # Of the nearest surface the normal is known without a ray; the facet that the lobe meets may be another one.
+    guess = dr.select(usable, refracted_axis(t, normal, towards), towards)
+    hit = t.scene.ray_intersect(mi.Ray3f(q, guess, t.length, 0.0, mi.Color0f()), mi.RayFlags.Minimal, False, True)
+    outside = dr.dot(hit.n, towards)
+    usable = hit.is_valid() & (outside > 0.0)
+    kappa = mi.Float(t.kappa)
+    if t.eta > 1.0:
         # A facet that is tilted by v turns what it refracts by v (1 - cos_o / (eta cos_i)) in the plane of incidence,
         # at grazing angles eta / (eta - 1) times as far as at normal ones, and across that plane about as far.
         outside = dr.maximum(outside, 0.0)
         inside = dr.sqrt(t.eta * t.eta - 1.0 + outside * outside)  # eta cos_i
         kappa = kappa * (SHARPER * (1.0 - 1.0 / t.eta)) / (1.0 - outside / inside)
-    return refracted_axis(t, normal, towards), kappa, usable
+    return refracted_axis(t, hit.n, towards), kappa, usable
 
 
 def lobe_pdf(t: Tables, kappa: Any, cosine: Any) -> Any:
@@ -71,11 +89,23 @@ def lobe_pdf(t: Tables, kappa: Any, cosine: Any) -> Any:
     return (1.0 - WIDE) * narrow + WIDE * sampling.von_mises_fisher_pdf(cosine, kappa / WIDER)
 
 
-def promise(t: Tables, empty: Any) -> Any:
-    """What a collision that lies `empty` mm below the surface may bring, beside one right below it: exp(-depth / mean
-    free path). 1 where all collisions count the same.
+def lobes_of(t: Tables, cams: Cameras, q: Any, before: Any, empty: Any) -> Any:
+    """How many even lobe connections a collision sends in the mean: in proportion to what one may bring, the phase
+    function towards the lobe's axis times the way out times the cosine at which it leaves.
+
+    q: its place, `empty` mm below the surface; before: the direction of the flight to it.
     """
-    return dr.maximum(dr.exp(-6.0 / t.reach * empty), LEAST) if t.even else 1.0
+    towards = dr.normalize(eye(cams, 0) - q)
+    free_paths = 6.0 / t.reach * empty
+    axis, cosine = towards, mi.Float(1.0)
+    if not t.matched:
+        normal = dr.gather(mi.Vector3f, t.normal, cell_index(t, q))
+        cosine = dr.maximum(dr.dot(normal, towards), 0.0)
+        axis = dr.select(cosine > 0.0, refracted_axis(t, normal, towards), towards)
+        free_paths *= t.eta * dr.rsqrt(t.eta * t.eta - 1.0 + cosine * cosine)
+    phase = sampling.henyey_greenstein_pdf(dr.dot(before, axis), t.g) * (1.0 / sampling.UNIFORM)
+    share = phase * dr.exp(-free_paths) * dr.maximum(cosine, GRAZING)
+    return CONNECTIONS * dr.clip(share, LEAST, MOST)
 
 
 @dr.syntax
@@ -97,6 +127,11 @@ def transmittance(t: Tables, origin: Any, direction: Any, length: Any, rng: Rng)
                 real, _ = medium_at(t, dr.fma(direction, travelled, origin), rng)
                 result *= 1.0 - real
     return result, rng
+
+
+def eye(cams: Cameras, camera: Any) -> Any:
+    """Where a camera stands."""
+    return mi.Point3f(*[dr.gather(mi.Float, cams.rows, camera * ROW + k) for k in range(3)])
 
 
 def project(cams: Cameras, camera: Any, point: Any) -> tuple[Any, Any, Any, Any, Any]:
@@ -162,9 +197,12 @@ def straight_transmittance(t: Tables, origin: Any, target: Any, rng: Rng) -> tup
 
 @dr.syntax
 def connect_lobes(
-    t: Tables, cams: Cameras, images: Images, tag: Any, point: Any, before: Any, weight: Any, rng: Rng
-) -> Rng:
-    """Connect one drawn collision to the cameras. `before` is the flight's direction before the collision."""
+    t: Tables, cams: Cameras, images: Images, tag: Any, point: Any, before: Any, weight: Any, lobes: Any,
+    rng: Rng,
+) -> Rng:  # fmt: skip
+    """Connect one drawn collision to the cameras, which sends `lobes` of such connections in the mean. `before` is the
+    flight's direction before the collision.
+    """
     pixels = cams.width * cams.height
     context = boundary_context(t)
     turn = mi.UInt32(0)
@@ -179,9 +217,7 @@ def connect_lobes(
                 value = weight * (phase * through * factor * times)
                 splat(images.lobes, images, base + pixel, value, t.lasers, rng, through > 0.0)
         else:
-            row = camera * ROW
-            eye = mi.Point3f(*[dr.gather(mi.Float, cams.rows, row + k) for k in range(3)])
-            axis, kappa, usable = lobe_at(t, point, eye)
+            axis, kappa, usable = lobe_at(t, point, eye(cams, camera))
             if dr.hint(usable):
                 width = mi.Float(kappa)
                 if dr.hint(t.even, mode="scalar"):
@@ -199,7 +235,7 @@ def connect_lobes(
                     seen &= (dr.dot(hit.n, towards) > 0.0) & (dr.dot(hit.n, omega) > 0.0)
                     if dr.hint(seen):
                         value = t.bsdf.eval(context, hit, hit.to_local(towards), True)[0]
-                        value *= factor * times * phase / (phase + lobe)
+                        value *= factor * times * phase / (phase + lobes * lobe)
                         if dr.hint(value > 0.0):
                             passed, rng = transmittance(t, point, omega, hit.t, rng)
                             value *= passed
@@ -213,12 +249,12 @@ def connect_lobes(
 @dr.syntax
 def connect_exit(
     t: Tables, cams: Cameras, images: Images, tag: Any, si: Any, direction: Any, weight: Any,
-    collision: Any, phase: Any, lobed: Any, surface_only: Any, rng: Rng,
+    collision: Any, phase: Any, lobes: Any, surface_only: Any, rng: Rng,
 ) -> Rng:  # fmt: skip
     """Connect a photon that meets the surface to the cameras through the boundary's BSDF.
 
-    collision, phase, lobed: the flight's last collision, the phase density of its direction and whether a lobe
-    connection could have made the same path (then the balance heuristic shares it).
+    collision, phase, lobes: the flight's last collision, the phase density of its direction and how many lobe
+    connections could have made the same path in the mean (the balance heuristic shares it with them).
     """
     pixels = cams.width * cams.height
     context = boundary_context(t)
@@ -231,7 +267,7 @@ def connect_exit(
             value = t.bsdf.eval(context, si, si.to_local(towards), True)[0] * (factor * times)
             axis, kappa, usable = lobe_at(t, collision, position)
             lobe = lobe_pdf(t, kappa, dr.dot(axis, direction))
-            value *= dr.select(lobed & usable, phase / (phase + lobe), 1.0)
+            value *= dr.select((lobes > 0.0) & usable, phase / (phase + lobes * lobe), 1.0)
             if dr.hint(value > 0.0):
                 start = mi.Point3f(si.p + si.n * t.lift)
                 blocked = t.scene.ray_test(mi.Ray3f(start, towards, FAR, 0.0, mi.Color0f()), False, True)

@@ -1,8 +1,8 @@
 """Reference images: the object under other light, traced through the same medium, to a stated noise.
 
-Which way a light is walked is a matter of its noise at equal time (docs/decisions/0054). A light that is the same from
-everywhere is met by every walk that leaves: walks start at the cameras' pixels. All others are walked from the light,
-with even connections to all cameras at once, and weight windows that lead to what the cameras see.
+Which way a light is walked is a matter of its noise at equal time (docs/decisions/0054). A light from all around is met
+by every walk that leaves: walks start at the camera's pixels. All others are walked from the light, for one camera at a
+time, with even connections to it and weight windows that lead to what it sees.
 
 How many walks there are is decided by pilot runs with random numbers of their own, which are thrown away: the images'
 own values have no part in it, so stopping biases nothing.
@@ -41,7 +41,7 @@ SHINE = 0.5  # variance of a walk that the surface reflects, beside its mean squ
 ENTRIES = 4096  # photons that tell where a light enters
 
 Sky = Uniform | Environment
-Render = Callable[[int, int], F32]  # (walks a half, number of the run) -> (C, 2, 2, L, H, W)
+Render = Callable[[int, int], F32]  # (walks a half, number of the run) -> (2, 2, L, H, W)
 
 
 def render_reference(
@@ -50,35 +50,29 @@ def render_reference(
     """(2, 2, L, H, W) halves of one light's image for each camera, with at most about `noise` (see `noise_of`) over
     each. Both halves are made of the same number of walks.
     """
-    if isinstance(light, Uniform | Environment) and alike_from_everywhere(light):
-        renders = [from_pixels(transport, light, camera, noise, seed + k) for k, camera in enumerate(cameras)]
-        return [_to_noise(render, noise, "pixel")[0] for render in renders]
-    images = list(_to_noise(from_light(transport, light, cameras, seed), noise, "light"))
-    if isinstance(light, Environment):  # few photons are reflected towards a camera: look from there instead
-        for k, (image, camera) in enumerate(zip(images, cameras, strict=True)):
-            image[:, LAYERS.index("surface")] = reflected_sky(transport, light, camera, noise, seed + k)
-    return images
-
-
-def alike_from_everywhere(light: Sky) -> bool:
-    """Whether its radiance is the same in all directions."""
-    return isinstance(light, Uniform) or not light.lobes
+    renders = [
+        from_pixels(transport, light, camera, noise, seed + k)
+        if isinstance(light, Sky)
+        else from_light(transport, light, camera, seed + k)
+        for k, camera in enumerate(cameras)
+    ]
+    return [_to_noise(render, noise, "pixel" if isinstance(light, Sky) else "light") for render in renders]
 
 
 def _to_noise(render: Render, noise: float, start: str) -> F32:
-    """The images with the noise asked for in each."""
+    """The image with the noise asked for."""
     walks = FIRST_PILOT[start]
     for run in itertools.count(1):
-        found = max(_pilot_noise(image, walks >= BLACK_AFTER[start]) for image in render(walks, run))
+        found = _pilot_noise(render(walks, run), walks >= BLACK_AFTER[start])
         needed = walks * (found / noise) ** 2 * MARGIN
         if found <= PILOT_ENDS * noise or 4 * walks > MOST_WALKS[start]:
             break
         walks *= 4
-    images = render(int(min(max(needed, 1), MOST_WALKS[start])), 0)
-    for kept in (noise_of(image) for image in images):
-        if kept > MARGIN * noise:
-            log.warning("a reference keeps %.0f %% noise, of which %.0f %% were to be left", 100 * kept, 100 * noise)
-    return images
+    image = render(int(min(max(needed, 1), MOST_WALKS[start])), 0)
+    kept = noise_of(image)
+    if kept > MARGIN * noise:
+        log.warning("a reference keeps %.0f %% noise, of which %.0f %% were to be left", 100 * kept, 100 * noise)
+    return image
 
 
 def _pilot_noise(image: F32, enough: bool) -> float:
@@ -87,18 +81,18 @@ def _pilot_noise(image: F32, enough: bool) -> float:
     return math.inf if found == 0.0 and not enough else found
 
 
-def from_light(transport: Transport, light: Light, cameras: Sequence[PinholeCamera], seed: int) -> Render:
-    """Walks that start at the light, for all cameras together."""
-    split = towards_views(transport, light, cameras)
+def from_light(transport: Transport, light: Light, camera: PinholeCamera, seed: int) -> Render:
+    """Walks that start at the light, for one camera."""
+    split = towards_view(transport, light, camera)
 
     def render(walks: int, run: int) -> F32:
         streams = len(HALVES) * run + np.arange(len(HALVES), dtype=np.uint32)
         traced = transport.trace(
             lambda group: light_source(light, transport.radius, group), len(HALVES), walks,
-            seed=seed, streams=streams, cameras=cameras, layers=len(LAYERS), split=split, even=True,
+            seed=seed, streams=streams, cameras=[camera], layers=len(LAYERS), split=split, even=True,
         )  # fmt: skip
         assert traced.images is not None
-        return np.moveaxis(traced.images, 2, 0)
+        return traced.images[:, :, 0]
 
     return render
 
@@ -110,7 +104,7 @@ def from_pixels(transport: Transport, light: Sky, camera: PinholeCamera, noise: 
         image = _sky_image(transport, light, camera, walks, seed, run)
         if run == 0:  # the surface reflects few of them
             image[:, LAYERS.index("surface")] = reflected_sky(transport, light, camera, noise, seed)
-        return image[None]
+        return image
 
     return render
 
@@ -144,16 +138,14 @@ def _sky_image(
     return image.reshape(*image.shape[:-1], camera.height, camera.width)
 
 
-def towards_views(transport: Transport, light: Light, cameras: Sequence[PinholeCamera]) -> Views | None:
-    """What windows lead a light's photons to; None for a beam that misses the object, or where no camera sees it."""
+def towards_view(transport: Transport, light: Light, camera: PinholeCamera) -> Views | None:
+    """What windows lead a light's photons to; None for a beam that misses the object, or where the camera sees none."""
     source = light_source(light, transport.radius, range(transport.lasers))
     number = dr.arange(mi.UInt32, ENTRIES)
     start, direction, _ = source.launch(Rng.of(mi.UInt32(0), mi.UInt32(0), number), dr.zeros(mi.UInt32, ENTRIES), True)
     rays = np.broadcast_to(np.array(start).T, (ENTRIES, 3)), np.broadcast_to(np.array(direction).T, (ENTRIES, 3))
-    entries = first_hits(transport, *rays)
-    seen = [first_hits(transport, *camera.rays(camera.pixel_centres())) for camera in cameras]
-    seen = [points for points in seen if len(points)]
-    return Views(entries, tuple(seen)) if len(entries) and seen else None
+    entries, seen = first_hits(transport, *rays), first_hits(transport, *camera.rays(camera.pixel_centres()))
+    return Views(entries, (seen,)) if len(entries) and len(seen) else None
 
 
 def first_hits(transport: Transport, origins: F64, directions: F64) -> F64:

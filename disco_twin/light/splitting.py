@@ -79,8 +79,9 @@ class Stack:
 
 
 def state_size(t: Tables, connects: bool) -> int:
-    """Floats of a state: place, direction, power; for connections to cameras the last collision and phase density."""
-    return 6 + t.lasers + (4 if connects else 0)
+    """Floats of a state: place, direction, power; and for connections to cameras the last
+    collision, phase density and lobes."""
+    return 6 + t.lasers + (5 if connects else 0)
 
 
 def new_stack(t: Tables, connects: bool, lanes: int) -> Stack:
@@ -97,8 +98,7 @@ def resume(t: Tables, stack: Stack, photon: Any, running: Any, weight: Any, conn
         v = [stack.numbers.read(top * size + k) for k in range(size)]
         photon.p, photon.d, photon.w = mi.Point3f(*v[0:3]), mi.Vector3f(*v[3:6]), weight(*v[6 : 6 + t.lasers])
         if dr.hint(connects, mode="scalar"):
-            photon.last = mi.Point3f(*v[-4:-1])
-            photon.phase, photon.in_reach = dr.abs(v[-1]), v[-1] > 0.0
+            photon.last, photon.phase, photon.lobes = mi.Point3f(*v[-5:-2]), v[-2], v[-1]
         photon.empty, photon.rate = surroundings(t, photon.p)
         photon.alive, photon.inside, photon.entered = mi.Bool(True), mi.Bool(True), mi.Bool(True)
         photon.clear, photon.steps = mi.Vector3f(0.0), mi.UInt32(0)
@@ -133,8 +133,8 @@ def weigh(
             if dr.hint((ratio >= 2.0) & (stack.depth < CAPACITY)):
                 count = mi.UInt32(dr.minimum(ratio, MOST_COPIES))
                 photon.w /= mi.Float(count)
-                phase = dr.select(photon.in_reach, photon.phase, -photon.phase)
-                values = [*photon.p, *photon.d, *[photon.w[k] for k in range(t.lasers)], *photon.last, phase]
+                power = [photon.w[k] for k in range(t.lasers)]
+                values = [*photon.p, *photon.d, *power, *photon.last, photon.phase, photon.lobes]
                 size = state_size(t, connects)
                 for k in range(size):
                     stack.numbers.write(values[k], stack.depth * size + k)

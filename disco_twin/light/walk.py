@@ -31,7 +31,7 @@ import drjit as dr
 import mitsuba as mi
 
 from disco_twin.light import sampling
-from disco_twin.light.connect import CONNECTIONS, connect_exit, connect_lobes, meet_sky, promise
+from disco_twin.light.connect import connect_exit, connect_lobes, lobes_of, meet_sky
 from disco_twin.light.sampling import Rng
 from disco_twin.light.sources import Source, weight_type
 from disco_twin.light.splitting import Window, counted, new_stack, resume, weigh
@@ -96,22 +96,23 @@ class Photon:
     empty: Any  # radius of a ball about p that holds no surface
     rate: Any  # majorant at p, 1/mm
     clear: Any  # lifts the origin of the next intersection test off the surface just left
-    # The last collision, for the balance heuristic: place, whether near the surface, phase density of the flight.
+    # The last collision, for the balance heuristic: place, lobe connections that it sends, phase density of the flight.
     last: Any
-    in_reach: Any
+    lobes: Any  # in the mean, to one camera
     phase: Any  # 0 before the first collision
 
 
 @dataclass
 class Reservoir:
-    """One collision drawn from those of an outer step: what all promise (their number, unless connections are even),
-    place, flight before it, power after it over its own promise.
+    """One collision drawn from those of an outer step: how many lobe connections all send in the mean, one of them if
+    any unless connections are even; place, flight before it, power after it, connections of its own.
     """
 
     seen: Any
     point: Any
     before: Any
     weight: Any
+    lobes: Any
 
 
 def no_photons(weight: Any, lanes: int) -> tuple[Photon, Reservoir]:
@@ -122,16 +123,17 @@ def no_photons(weight: Any, lanes: int) -> tuple[Photon, Reservoir]:
     down.z = -1.0
     photon = Photon(
         mi.Point3f(point), down, weight(power), mi.UInt32(integer), mi.UInt32(integer), mi.Bool(flag), mi.Bool(flag),
-        mi.Bool(flag), mi.Float(number), mi.Float(number + 1.0), mi.Vector3f(vector), mi.Point3f(point), mi.Bool(flag),
-        mi.Float(number),
+        mi.Bool(flag), mi.Float(number), mi.Float(number + 1.0), mi.Vector3f(vector), mi.Point3f(point),
+        mi.Float(number), mi.Float(number),
     )  # fmt: skip
-    return photon, Reservoir(mi.Float(number), mi.Point3f(point), mi.Vector3f(vector), weight(power))
+    drawn = Reservoir(mi.Float(number), mi.Point3f(point), mi.Vector3f(vector), weight(power), mi.Float(number))
+    return photon, drawn
 
 
 @dr.syntax
 def collide(
-    t: Tables, photon: Photon, rate: Any, reservoir: Reservoir, sums: Tally, rng: Rng, connects: bool,
-    window: Window | None, first_tag: Any,
+    t: Tables, photon: Photon, rate: Any, reservoir: Reservoir, sums: Tally, rng: Rng,
+    cams: Cameras | None, window: Window | None, first_tag: Any,
 ) -> Any:  # fmt: skip
     """A possible collision at the photon's place, after a flight under the majorant `rate`: absorb, offer it to the
     reservoir, scatter; or nothing (null).
@@ -143,14 +145,20 @@ def collide(
         sums.absorbed += type(sums.absorbed)(photon.w * (1.0 - albedo))
         photon.w *= albedo
         near = near_surface(t, photon.empty)
-        if dr.hint(connects, mode="scalar"):
-            share = promise(t, photon.empty)
-            chance = share * counted(window, first_tag + photon.tag, photon.p)
-            reservoir.seen = dr.select(near, reservoir.seen + chance, reservoir.seen)
+        lobes = dr.select(near, 1.0, mi.Float(0.0))
+        if dr.hint(cams is not None, mode="scalar"):
+            if dr.hint(t.even, mode="scalar"):
+                assert cams is not None
+                if dr.hint(near):
+                    lobes = lobes_of(t, cams, photon.p, photon.d, photon.empty)
+            chance = lobes * counted(window, first_tag + photon.tag, photon.p)
+            reservoir.seen += chance
             take = near & (rng.next() * reservoir.seen < chance)
             reservoir.point = dr.select(take, photon.p, reservoir.point)
             reservoir.before = dr.select(take, photon.d, reservoir.before)
-            reservoir.weight = dr.select(take, photon.w / share, reservoir.weight)
+            power = photon.w / lobes if t.even and t.matched else photon.w
+            reservoir.weight = dr.select(take, power, reservoir.weight)
+            reservoir.lobes = dr.select(take, lobes, reservoir.lobes)
         scattered = sampling.uniform_sphere(rng)
         photon.phase = mi.Float(sampling.UNIFORM)
         if dr.hint(not t.isotropic, mode="scalar"):
@@ -158,7 +166,7 @@ def collide(
             photon.phase = sampling.henyey_greenstein_pdf(dr.dot(photon.d, scattered), t.g)
         photon.d = mi.Vector3f(scattered)
         photon.last = mi.Point3f(photon.p)
-        photon.in_reach = near
+        photon.lobes = mi.Float(lobes)
     return photon, reservoir, sums, rng
 
 
@@ -180,11 +188,11 @@ def cross(
         si.sh_frame = mi.Frame3f(si.n)
         si.wi = si.to_local(-photon.d)
         if dr.hint(cams is not None, mode="scalar"):
-            lobed = photon.inside & photon.in_reach & (dr.norm(si.p - photon.last) < t.length)
+            lobed = photon.inside & (photon.lobes > 0.0) & (dr.norm(si.p - photon.last) < t.length)
             weight = photon.w * counted(window, first_tag + photon.tag, dr.select(lobed, photon.last, si.p))
             rng = connect_exit(
-                t, cams, images, photon.tag, si, photon.d, weight, photon.last, photon.phase, lobed, ~photon.entered,
-                rng,
+                t, cams, images, photon.tag, si, photon.d, weight, photon.last, photon.phase,
+                dr.select(lobed, photon.lobes, 0.0), ~photon.entered, rng,
             )  # fmt: skip
         sample, value = t.bsdf.sample(boundary_context(t), si, rng.next(), rng.next2(), True)
         after = photon.w * value[0]
@@ -197,7 +205,7 @@ def cross(
         photon.d = mi.Vector3f(si.to_world(sample.wo))
         photon.inside = goes_in
     photon.entered |= photon.inside
-    photon.in_reach = mi.Bool(False)
+    photon.lobes = mi.Float(0.0)
     photon.p = mi.Point3f(si.p)
     photon.clear = mi.Vector3f(si.n * dr.select(photon.inside, -t.lift, t.lift))
     _, photon.rate = surroundings(t, photon.p)
@@ -232,9 +240,7 @@ def fly(
             sums.inside += wide(dr.select(leaked, photon.w, 0.0))
             photon.alive = ~leaked
             if dr.hint(~leaked):
-                photon, reservoir, sums, rng = collide(
-                    t, photon, rate, reservoir, sums, rng, cams is not None, window, first_tag
-                )
+                photon, reservoir, sums, rng = collide(t, photon, rate, reservoir, sums, rng, cams, window, first_tag)
         else:
             if dr.hint(sky is not None, mode="scalar"):
                 # Not of a walk that has met nothing: what lies behind the object is no part of its image.
@@ -286,8 +292,8 @@ def walk(
             sums.launched += wide(dr.select(running, photon.w, 0.0))
             photon.alive = running & (dr.max(photon.w) > 0.0)
             photon.tag, photon.steps, photon.clear = tag, mi.UInt32(0), mi.Vector3f(0.0)
-            photon.inside, photon.entered, photon.in_reach = mi.Bool(False), mi.Bool(False), mi.Bool(False)
-            photon.phase = mi.Float(0.0)
+            photon.inside, photon.entered = mi.Bool(False), mi.Bool(False)
+            photon.lobes, photon.phase = mi.Float(0.0), mi.Float(0.0)
 
         # 2. Collisions that need no intersection test.
         k = mi.UInt32(0)
@@ -302,9 +308,7 @@ def walk(
                 # Copies: two names of one object would be merged as one when Dr.Jit joins the branches.
                 photon.p, photon.empty, photon.rate = mi.Point3f(q), mi.Float(ball), mi.Float(there)
                 photon.clear = mi.Vector3f(0.0)
-                photon, reservoir, sums, rng = collide(
-                    t, photon, rate, reservoir, sums, rng, cams is not None, window, first_tag
-                )
+                photon, reservoir, sums, rng = collide(t, photon, rate, reservoir, sums, rng, cams, window, first_tag)
 
         # 3. The surface, or a collision that the distance field could not vouch for.
         if dr.hint(photon.alive & pending):
@@ -315,15 +319,17 @@ def walk(
         # 4. One drawn collision connects to the cameras, also of a photon that has just left.
         if dr.hint(cams is not None, mode="scalar"):
             if dr.hint(t.even, mode="scalar"):
-                times = dr.floor(reservoir.seen * CONNECTIONS + rng.next())
-                drawn = reservoir.weight * (1.0 / CONNECTIONS)
+                times = dr.floor(reservoir.seen + rng.next())
                 while dr.hint(times > 0.0, label="connections"):
-                    rng = connect_lobes(t, cams, images, photon.tag, reservoir.point, reservoir.before, drawn, rng)
+                    rng = connect_lobes(
+                        t, cams, images, photon.tag, reservoir.point, reservoir.before, reservoir.weight,
+                        reservoir.lobes, rng,
+                    )  # fmt: skip
                     times -= 1.0
                 reservoir.seen = mi.Float(0.0)
             elif dr.hint(reservoir.seen > 0.0):
                 drawn = reservoir.weight * reservoir.seen
-                rng = connect_lobes(t, cams, images, photon.tag, reservoir.point, reservoir.before, drawn, rng)
+                rng = connect_lobes(t, cams, images, photon.tag, reservoir.point, reservoir.before, drawn, 1.0, rng)
                 reservoir.seen = mi.Float(0.0)
 
         # 5. The weight window: Russian roulette, splitting.

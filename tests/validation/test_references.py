@@ -62,8 +62,8 @@ def test_a_shipped_reference_is_rendered_again(repository: Path) -> None:
     shipped = [load_reference(reference_path(folder, light, view)) for view in scene.relight.views]
     cameras = [PinholeCamera.from_config(view) for view in scene.relight.views]
     transport = Transport(build_object(scene))
-    render = from_light(transport, light, cameras, 900)
-    halves = [render(WALKS, 1 + k) for k in range(REPLICATES // 2)]
+    renders = [from_light(transport, light, camera, 900) for camera in cameras]
+    halves = [[render(WALKS, 1 + k) for render in renders] for k in range(REPLICATES // 2)]
     for view, reference in enumerate(shipped):
         again = block_means(np.concatenate([h[view] for h in halves]).astype(float))  # (N, layer, laser, block)
         there = block_means(reference.halves.astype(float).mean(axis=0))

@@ -23,7 +23,7 @@ from disco_twin.light import rendering
 from disco_twin.light.importance import Diffusion, Views, view_targets
 from disco_twin.light.pixels import candidate_pixels
 from disco_twin.light.references import noise_of
-from disco_twin.light.rendering import from_light, from_pixels, towards_views
+from disco_twin.light.rendering import Sky, from_light, from_pixels, towards_view
 from disco_twin.light.sources import light_source
 from disco_twin.light.transport import Transport
 from disco_twin.object.build import Medium, TwinObject
@@ -63,8 +63,8 @@ def plain(transport: Transport, light: Light, views: list[PinholeCamera], walks:
 
 
 def replicates(renders: list[Callable[[int, int], np.ndarray]], walks: int) -> F64:
-    """(REPLICATES, C, layer, H, W) halves of as many runs as it takes; one render serves some of the cameras."""
-    runs = [np.concatenate([render(walks, run) for render in renders]) for run in range(1, 1 + REPLICATES // 2)]
+    """(REPLICATES, C, layer, H, W) halves of as many runs as it takes, a render for each camera."""
+    runs = [np.stack([render(walks, run) for render in renders]) for run in range(1, 1 + REPLICATES // 2)]
     return np.moveaxis(np.stack(runs)[:, :, :, :, 0].astype(float), 1, 2).reshape(REPLICATES, -1, 2, PIXELS, PIXELS)
 
 
@@ -84,11 +84,10 @@ def assert_same(ours: F64, theirs: F64, label: str) -> None:
 
 def compare(obj: TwinObject, name: str, walks: int) -> None:
     transport, light, views = Transport(obj, cells=64), LIGHTS[name], cameras()
-    if isinstance(light, Uniform):
-        renders = [from_pixels(transport, light, view, 1.0, 92) for view in views]
-        ours = replicates(renders, max(1, walks // 500))
+    if isinstance(light, Sky):
+        ours = replicates([from_pixels(transport, light, view, 1.0, 92) for view in views], max(1, walks // 500))
     else:
-        ours = replicates([from_light(transport, light, views, 92)], walks)
+        ours = replicates([from_light(transport, light, view, 92) for view in views], walks)
     assert_same(ours, plain(transport, light, views, 3 * walks), name)
 
 
@@ -125,9 +124,9 @@ def test_wavelengths_that_scatter_apart(name: str) -> None:
     if isinstance(two, Uniform):
         renders = [from_pixels(transport, two, view, 1.0, 92) for view in views]
     else:
-        renders = [from_light(transport, two, views, 92)]
+        renders = [from_light(transport, two, view, 92) for view in views]
     walks = 40 if isinstance(two, Uniform) else 20_000
-    runs = [np.concatenate([render(walks, run) for render in renders]) for run in range(1, 1 + REPLICATES // 2)]
+    runs = [np.stack([render(walks, run) for render in renders]) for run in range(1, 1 + REPLICATES // 2)]
     second = np.moveaxis(np.stack(runs)[:, :, :, :, 1].astype(float), 1, 2).reshape(REPLICATES, -1, 2, PIXELS, PIXELS)
     assert_same(second, plain(Transport(obj, cells=64), light, views, 60_000), name)
 
@@ -160,12 +159,12 @@ def test_windows_lead_to_the_views() -> None:
     """Expected: targets far lower where a view looks than where none does, and about one where the light enters."""
     obj, views = bumpy(), cameras()
     transport = Transport(obj, cells=64)
-    split = towards_views(transport, LIGHTS["behind"], views)
+    split = towards_view(transport, LIGHTS["behind"], views[0])
     assert isinstance(split, Views)
     from disco_twin.light.importance import diffusion
 
     estimate: Diffusion = diffusion(obj, 0)
-    one = view_targets(estimate, Views(split.entries, split.seen[:1]))[0]
+    one = view_targets(estimate, split)[0]
 
     def at(points: F64) -> F64:
         index = np.floor((points - estimate.low) / estimate.cell).astype(int)

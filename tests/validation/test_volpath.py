@@ -87,8 +87,8 @@ def test_agrees_with_stock_volpath(boundary: TwinBoundary, heterogeneous: bool, 
     if isinstance(light, Uniform):
         render, walks = from_pixels(transport, light, camera, 0.1, 7), 250
     else:
-        render, walks = from_light(transport, light, [camera], 7), 100_000
-    layers = [render(walks, run)[0][:, :, 0] for run in range(passes // 2)]
+        render, walks = from_light(transport, light, camera, 7), 100_000
+    layers = [render(walks, run)[:, :, 0] for run in range(passes // 2)]
     below, reflected = np.moveaxis(blocks(np.concatenate(layers).astype(np.float64)), 1, 0)
     ours = below + reflected
     seen = (ours > 0).all(axis=0) & (theirs > 0).all(axis=0)  # not the background
@@ -124,8 +124,8 @@ def test_the_quick_scene_agrees_with_stock_volpath(repository: Path, tmp_path: P
     light = Directional(direction=next(x for x in scene.relight.lights if x.name == "directional").direction)
     theirs = blocks(volpath_images(obj, view, light, tmp_path, 16, 16))
     transport = Transport(obj)
-    render = from_light(transport, light, [view], 7)
-    traced = [render(50_000, run)[0].sum(axis=1)[:, 0] for run in range(8)]
+    render = from_light(transport, light, view, 7)
+    traced = [render(50_000, run).sum(axis=1)[:, 0] for run in range(8)]
     ours = blocks(np.concatenate(traced).astype(np.float64))
     lit = (ours > 0).all(axis=0) & (theirs > 0).all(axis=0)
     assert lit.sum() >= 12

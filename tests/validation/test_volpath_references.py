@@ -84,7 +84,7 @@ def test_another_index_is_found(eta: float, right: bool) -> None:
     job = next(job for job in JOBS if (job.scene.name, job.light.name) == ("bracket", "uniform"))
     obj = replace(job.obj, boundary=replace(job.obj.boundary, eta=eta))
     render = from_pixels(Transport(obj, cells=64), job.light, PinholeCamera.from_config(job.view), 0.1, 5)
-    ours, theirs = render(16, 0)[0].astype(np.float64), load_reference(job.path).halves.astype(np.float64)
+    ours, theirs = render(16, 0).astype(np.float64), load_reference(job.path).halves.astype(np.float64)
     z = {name: z_of_blocks(ours[:, k], theirs[:, k]) for k, name in enumerate(LAYERS)}
     for layer, own in z.items():
         if right:
