@@ -70,7 +70,10 @@ def collect(folder: RunFolder, method: str | None, chosen: Callable[[Relightable
     method = method or next(iter(made.methods))
     experiment, exact = Experiment(scene), load_model(folder, method)
     if exact.lasers > 3:
-        raise InputError("more wavelengths than a page shows", file=folder.root, value=exact.lasers, allowed="1 to 3")
+        remedy = "choose three lasers in the scene, and run it again"
+        raise InputError(
+            "too many to show", file=folder.root, key="lasers", value=exact.lasers, allowed="1 to 3", remedy=remedy
+        )
     cut = chosen(exact)
     block, numbers = model_block(exact, factorised(exact, cut), scene.relight.lights)
     lights, views = scene.relight.lights, scene.relight.views

@@ -14,7 +14,6 @@ from hw.base.config import Strict, in_words
 WITHOUT = (
     "pipeline/geometry/mesh_file.py",  # `load_mesh` adds one
     "pipeline/geometry/mesh_formats.py",
-    "disco_twin/view/collect.py",  # of more lasers than a rig can have
 )
 
 
