@@ -82,8 +82,10 @@ def lasers_in_one() -> int:
 def interior(medium: Medium) -> dict[str, Any]:
     """Mitsuba's description of what fills the object.
 
-    Raises: InputError where the lasers of one render do not have one sigma_t and one g.
+    Raises: InputError where the lasers of one render do not have one sigma_t and one g, or where g varies.
     """
+    if medium.g_voxels is not None:
+        raise InputError("one phase function serves the whole of Mitsuba's medium", allowed="one g for all voxels")
     lasers = lasers_in_one()
     alike = len(medium.g) >= lasers and len(set(medium.g[:lasers])) == 1
     if not alike or np.ptp(medium.sigma_t[:lasers], axis=0).any():

@@ -38,7 +38,10 @@ MOST_WALKS = (1 << 32) - 1
 
 
 def splat(scene: Scene) -> float:
-    """Radiance per watt launched that one walk adds to a pixel that it reaches, in the nearest camera, 1/(mm^2 sr)."""
+    """Radiance per watt launched that one walk adds to a pixel that it reaches, in the nearest camera, 1/(mm^2 sr).
+
+    By the g of the base: features are taken for a small part.
+    """
     boundary, g = scene.object.boundary, float(np.max(np.abs(scene.object.medium.g)))
     cameras = [PinholeCamera.from_config(c) for c in scene.rig.cameras]
     unit = max(float(c.focal.prod() / (c.position @ c.position)) for c in cameras)

@@ -11,14 +11,13 @@ def left_out_by_the_twin(experiment: Experiment) -> list[dict[str, str]]:
     """Rows {what, because} of what the simulation leaves out; decided from the scene alone."""
     scene, medium = experiment.scene, experiment.object.medium
     out = []
-    if all(np.ptp(m) == 0 for a in (medium.sigma_t, medium.albedo) for m in a):
+    if medium.g_voxels is None and all(np.ptp(m) == 0 for a in (medium.sigma_t, medium.albedo) for m in a):
         out.append(("medium grid", "the medium is homogeneous"))
-    same = all(np.array_equal(s, medium.sigma_t[0]) for s in medium.sigma_t) and len(set(medium.g)) == 1
-    if len(medium.sigma_t) > 1 and same:
+    if len(medium.sigma_t) > 1 and len(medium.groups()) == 1:
         out.append(("a walk per wavelength", "sigma_t and g are the same at all wavelengths: one walk serves them"))
     if experiment.object.boundary.kind == "matched":
         out.append(("boundary sampling", "the object is index-matched"))
-    if all(g == 0 for g in medium.g):
+    if medium.g_voxels is None and all(g == 0 for g in medium.g):
         out.append(("phase function sampling", "scattering is isotropic (g = 0)"))
     faults = [name for name, on in scene.rig.faults.model_dump().items() if not on]
     if faults:

@@ -89,11 +89,11 @@ def lobe_pdf(t: Tables, kappa: Any, cosine: Any) -> Any:
     return (1.0 - WIDE) * narrow + WIDE * sampling.von_mises_fisher_pdf(cosine, kappa / WIDER)
 
 
-def lobes_of(t: Tables, cams: Cameras, q: Any, before: Any, empty: Any) -> Any:
+def lobes_of(t: Tables, cams: Cameras, q: Any, before: Any, g: Any, empty: Any) -> Any:
     """How many even lobe connections a collision sends in the mean: in proportion to what one may bring, the phase
     function towards the lobe's axis times the way out times the cosine at which it leaves.
 
-    q: its place, `empty` mm below the surface; before: the direction of the flight to it.
+    q: its place, `empty` mm below the surface; before: the direction of the flight to it; g: the asymmetry there.
     """
     towards = dr.normalize(eye(cams, 0) - q)
     free_paths = 6.0 / t.reach * empty
@@ -103,7 +103,7 @@ def lobes_of(t: Tables, cams: Cameras, q: Any, before: Any, empty: Any) -> Any:
         cosine = dr.maximum(dr.dot(normal, towards), 0.0)
         axis = dr.select(cosine > 0.0, refracted_axis(t, normal, towards), towards)
         free_paths *= t.eta * dr.rsqrt(t.eta * t.eta - 1.0 + cosine * cosine)
-    phase = sampling.henyey_greenstein_pdf(dr.dot(before, axis), t.g) * (1.0 / sampling.UNIFORM)
+    phase = sampling.henyey_greenstein_pdf(dr.dot(before, axis), g) * (1.0 / sampling.UNIFORM)
     share = phase * dr.exp(-free_paths) * dr.maximum(cosine, GRAZING)
     return CONNECTIONS * dr.clip(share, LEAST, MOST)
 
@@ -124,7 +124,7 @@ def transmittance(t: Tables, origin: Any, direction: Any, length: Any, rng: Rng)
             travelled += sampling.exponential(rng) / t.majorant
             going = travelled < length
             if dr.hint(going):
-                real, _ = medium_at(t, dr.fma(direction, travelled, origin), rng)
+                real, _, _ = medium_at(t, dr.fma(direction, travelled, origin), rng)
                 result *= 1.0 - real
     return result, rng
 
@@ -197,11 +197,11 @@ def straight_transmittance(t: Tables, origin: Any, target: Any, rng: Rng) -> tup
 
 @dr.syntax
 def connect_lobes(
-    t: Tables, cams: Cameras, images: Images, tag: Any, point: Any, before: Any, weight: Any, lobes: Any,
-    rng: Rng,
+    t: Tables, cams: Cameras, images: Images, tag: Any, point: Any, before: Any, weight: Any, g: Any,
+    lobes: Any, rng: Rng,
 ) -> Rng:  # fmt: skip
     """Connect one drawn collision to the cameras, which sends `lobes` of such connections in the mean. `before` is the
-    flight's direction before the collision.
+    flight's direction before the collision, g the asymmetry there.
     """
     pixels = cams.width * cams.height
     context = boundary_context(t)
@@ -213,7 +213,7 @@ def connect_lobes(
             position, towards, pixel, factor, seen = project(cams, camera, point)
             if dr.hint(seen):
                 through, rng = straight_transmittance(t, point, position, rng)
-                phase = sampling.henyey_greenstein_pdf(dr.dot(before, towards), t.g)
+                phase = sampling.henyey_greenstein_pdf(dr.dot(before, towards), g)
                 value = weight * (phase * through * factor * times)
                 splat(images.lobes, images, base + pixel, value, t.lasers, rng, through > 0.0)
         else:
@@ -224,7 +224,7 @@ def connect_lobes(
                     width = dr.select(rng.next() < WIDE, kappa / WIDER, kappa)
                 omega = sampling.von_mises_fisher(rng, axis, width)
                 lobe = lobe_pdf(t, kappa, dr.dot(axis, omega))
-                phase = sampling.henyey_greenstein_pdf(dr.dot(before, omega), t.g)
+                phase = sampling.henyey_greenstein_pdf(dr.dot(before, omega), g)
                 hit = t.scene.ray_intersect(
                     mi.Ray3f(point, omega, t.length, 0.0, mi.Color0f()), mi.RayFlags.Minimal, False, True
                 )

@@ -94,20 +94,23 @@ class Diffusion:
         return np.asarray(self.factor.solve(right))
 
 
-def reduced_coefficients(obj: TwinObject, laser: int, centres: F64, cell: float) -> tuple[F64, F64]:
-    """(N,) sigma_a and sigma_s' in 1/mm, averaged over the cells at `centres` (N, 3)."""
+def mean_coefficients(obj: TwinObject, laser: int, centres: F64, cell: float) -> tuple[F64, F64, F64]:
+    """(N,) sigma_a, sigma_s and sigma_s' in 1/mm, averaged over the cells at `centres` (N, 3)."""
     medium = obj.medium
     sigma_t = medium.sigma_t[laser].astype(float)
     scatter = sigma_t * medium.albedo[laser]
-    sums = np.zeros((2, len(centres)))
+    read = [sigma_t - scatter, scatter]
+    if medium.g_voxels is not None:
+        read.append(scatter * (1 - medium.g_voxels[laser].astype(float)))
+    sums = np.zeros((len(read), len(centres)))
     size = np.asarray(medium.high) - np.asarray(medium.low)
     steps = (np.arange(INNER_POINTS) + 0.5) / INNER_POINTS - 0.5
     for shift in np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3) * cell:
         grid = (centres + shift - medium.low) / size * np.array(sigma_t.shape[::-1]) - 0.5
-        for k, values in enumerate((sigma_t - scatter, scatter)):
+        for k, values in enumerate(read):
             sums[k] += ndimage.map_coordinates(values, grid[:, ::-1].T, order=1, mode="nearest")
-    absorption, scattering = sums / INNER_POINTS**3
-    return absorption, scattering * (1 - medium.g[laser])
+    absorption, scattering, *reduced = sums / INNER_POINTS**3
+    return absorption, scattering, reduced[0] if reduced else scattering * (1 - medium.g[laser])
 
 
 def diffusion(obj: TwinObject, laser: int, cells: int = CELLS) -> Diffusion:
@@ -124,8 +127,8 @@ def diffusion(obj: TwinObject, laser: int, cells: int = CELLS) -> Diffusion:
         filled[n // 2, n // 2, n // 2] = True
     number = np.full((n, n, n), -1)
     number[filled] = np.arange(filled.sum())
-    absorption, scattering = reduced_coefficients(obj, laser, centres[filled.ravel()], cell)
-    transport = np.maximum(absorption + scattering, 1e-3 / cell)
+    absorption, scattering, reduced = mean_coefficients(obj, laser, centres[filled.ravel()], cell)
+    transport = np.maximum(absorption + reduced, 1e-3 / cell)
     d = 1 / (3 * transport)
     eta = obj.boundary.eta
     # Internal diffuse reflection of a smooth surface (Egan and Hilgeman 1979).
@@ -153,8 +156,7 @@ def diffusion(obj: TwinObject, laser: int, cells: int = CELLS) -> Diffusion:
     options = {"SymmetricMode": True}
     factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
     nearest = ndimage.distance_transform_edt(~filled, return_indices=True, return_distances=False)
-    sigma_t = absorption + scattering / (1 - obj.medium.g[laser])
-    return Diffusion(filled, number[tuple(nearest)], corner, cell, factor, sigma_t, float(leak))
+    return Diffusion(filled, number[tuple(nearest)], corner, cell, factor, absorption + scattering, float(leak))
 
 
 def view_targets(estimate: Diffusion, views: Views) -> F64:

@@ -69,13 +69,7 @@ class Moments:
 
 def copies_of_one_laser(obj: TwinObject, laser: int) -> TwinObject:
     """The object with three wavelengths that are all this one."""
-    medium, own = obj.medium, [laser] * 3
-    return replace(
-        obj,
-        medium=replace(
-            medium, sigma_t=medium.sigma_t[own], albedo=medium.albedo[own], g=(medium.g[laser],) * 3
-        ),
-    )  # fmt: skip
+    return replace(obj, medium=obj.medium.of_lasers([laser] * 3))
 
 
 def moments(transport: Transport, basis: sparse.csr_matrix, columns: I64, laser: int, walks: int, seed: int) -> Moments:

@@ -43,6 +43,7 @@ def light_key(obj: TwinObject, config: RigConfig, actual: ActualRig) -> str:
     medium, boundary = obj.medium, obj.boundary
     projector = actual.projector
     parts: list[ArrayLike] = [obj.mesh.vertices, obj.mesh.faces, medium.sigma_t, medium.albedo, medium.g]
+    parts += [] if medium.g_voxels is None else [medium.g_voxels]
     parts += [medium.low, medium.high, *actual.turns, projector.pose, projector.full_angle_rad]
     parts += [projector.steps, projector.separation_mm, actual.mirror_steps, actual.seed]
     for camera in actual.cameras:

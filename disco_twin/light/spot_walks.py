@@ -36,8 +36,7 @@ class SpotWalks:
 
 def walk_seconds(obj: TwinObject, collisions: float) -> float:
     """Seconds of a core for a plain walk of all wavelengths, each scattered so often (`Diffusion.collisions`)."""
-    groups = len({(m.tobytes(), g) for m, g in zip(obj.medium.sigma_t, obj.medium.g, strict=True)})
-    return groups * (START_S + COLLISION_S * collisions)
+    return len(obj.medium.groups()) * (START_S + COLLISION_S * collisions)
 
 
 def photon_density(estimate: Diffusion, fluence: F64, walks: SpotWalks) -> F64:

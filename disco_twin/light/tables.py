@@ -32,8 +32,9 @@ class Tables(Opaque):
     even: bool  # connections are even (connect.py)
     eta: float
     homogeneous: bool
-    isotropic: bool
-    g: Any
+    isotropic: bool  # g = 0 everywhere
+    g: Any  # of the medium, where it is one
+    g_voxels: Any  # Float, per voxel, where it varies; else None
     majorant: Any  # 1/mm, of the whole object
     local: bool  # whether `distance` holds a local majorant beside each distance
     stretch: Any  # mm along each axis for which a local majorant holds
@@ -143,24 +144,28 @@ def free_flight(t: Tables, direction: Any, rate: Any, rng: Rng) -> tuple[Any, An
     return dr.minimum(flight, longest), dr.select(flight < longest, rate, dr.inf)
 
 
-def medium_at(t: Tables, q: Any, rng: Rng) -> tuple[Any, Any]:
-    """Probability of a real collision and the albedo per wavelength at q.
+def medium_at(t: Tables, q: Any, rng: Rng) -> tuple[Any, Any, Any]:
+    """Probability of a real collision, the albedo per wavelength and the asymmetry at q.
 
-    One voxel of the eight is drawn with its trilinear weight: sigma_t and sigma_s = albedo * sigma_t are then
-    interpolated linearly in expectation, which is all that an unbiased walk needs, at one look-up instead of eight.
+    One voxel of the eight is drawn with its trilinear weight: sigma_t, sigma_s = albedo * sigma_t and sigma_s times the
+    phase function are then interpolated linearly in expectation, which is all that an unbiased walk needs, at one
+    look-up instead of eight.
     """
-    if t.homogeneous:
-        return mi.Float(1.0), t.albedo
+    if t.homogeneous and t.g_voxels is None:
+        return mi.Float(1.0), t.albedo, t.g
     grid = (q - t.medium_low) * t.medium_scale - 0.5
     voxel = mi.Point3i(dr.floor(grid + mi.Point3f(rng.next(), rng.next(), rng.next())))
     voxel = mi.Point3i(
         dr.clip(voxel.x, 0, t.dims.x - 1), dr.clip(voxel.y, 0, t.dims.y - 1), dr.clip(voxel.z, 0, t.dims.z - 1)
     )
     index = mi.UInt32((voxel.z * t.dims.y + voxel.y) * t.dims.x + voxel.x)
+    g = t.g if t.g_voxels is None else dr.gather(mi.Float, t.g_voxels, index)
+    if t.homogeneous:
+        return mi.Float(1.0), t.albedo, g
     if t.lasers == 1:
         value = dr.gather(mi.Vector2f, t.medium, index)
-        return value[0], mi.Color1f(value[1])
+        return value[0], mi.Color1f(value[1]), g
     value = dr.gather(mi.Vector4f, t.medium, index)
     if t.lasers == 2:
-        return value[0], mi.Vector2f(value[1], value[2])
-    return value[0], mi.Color3f(value[1], value[2], value[3])
+        return value[0], mi.Vector2f(value[1], value[2]), g
+    return value[0], mi.Color3f(value[1], value[2], value[3]), g

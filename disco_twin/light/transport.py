@@ -74,7 +74,7 @@ class Transport:
         self.faces = np.asarray(obj.mesh.faces, np.int64)
         self.radius = float(np.linalg.norm(self.vertices, axis=1).max()) * 1.001
         self.lasers = len(obj.medium.sigma_t)
-        self.groups = wavelength_groups(obj.medium)
+        self.groups = obj.medium.groups()
         bsdfs: dict[str, dict[str, Any]] = {
             "rough": {
                 "type": "roughdielectric", "int_ior": obj.boundary.eta, "ext_ior": 1.0,
@@ -161,13 +161,14 @@ class Transport:
         local = self._local_majorants(sigma_t) if self._local and not homogeneous else None
         bounds = np.stack([self._field.distance, local.rate], axis=-1) if local is not None else None
         nz, ny, nx = sigma_t.shape
-        g = float(medium.g[group[0]])
+        g, g_voxels = float(medium.g[group[0]]), medium.g_voxels
         return kernel.Tables(
             **self._shared,
             lasers=len(group),
             homogeneous=homogeneous and sigma_t.max() > 0,
-            isotropic=g == 0.0,
+            isotropic=g == 0.0 and g_voxels is None,
             g=dr.opaque(mi.Float, g),
+            g_voxels=None if g_voxels is None else to_float(g_voxels[group[0]]),
             majorant=dr.opaque(mi.Float, majorant),
             local=local is not None,
             stretch=dr.opaque(mi.Float, local.stretch if local is not None else FAR),
@@ -312,19 +313,6 @@ def stretches(walks: int, step: int) -> Iterator[tuple[int, int]]:
     for low, high in ((0, walks // 2), (walks // 2, walks)):
         for start in range(low, high, step):
             yield start, min(step, high - start)
-
-
-def wavelength_groups(medium: Medium) -> tuple[tuple[int, ...], ...]:
-    """Laser indices that share sigma_t and g exactly, so that one walk serves them."""
-    groups: list[list[int]] = []
-    for k in range(len(medium.sigma_t)):
-        for group in groups:
-            if medium.g[group[0]] == medium.g[k] and np.array_equal(medium.sigma_t[group[0]], medium.sigma_t[k]):
-                group.append(k)
-                break
-        else:
-            groups.append([k])
-    return tuple(tuple(g) for g in groups)
 
 
 def mesh_scene(vertices: F64, faces: I64, bsdf: dict[str, Any]) -> mi.Scene:

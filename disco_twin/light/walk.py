@@ -105,7 +105,8 @@ class Photon:
 @dataclass
 class Reservoir:
     """One collision drawn from those of an outer step: how many lobe connections all send in the mean, one of them if
-    any unless connections are even; place, flight before it, power after it, connections of its own.
+    any unless connections are even; place, flight before it, power after it, connections of its own, asymmetry there
+    (None where it is one for all).
     """
 
     seen: Any
@@ -113,9 +114,10 @@ class Reservoir:
     before: Any
     weight: Any
     lobes: Any
+    g: Any
 
 
-def no_photons(weight: Any, lanes: int) -> tuple[Photon, Reservoir]:
+def no_photons(t: Tables, weight: Any, lanes: int) -> tuple[Photon, Reservoir]:
     """Lanes without a photon."""
     vector, number, flag = dr.zeros(mi.Vector3f, lanes), dr.zeros(mi.Float, lanes), dr.zeros(mi.Bool, lanes)
     point, power, integer = dr.zeros(mi.Point3f, lanes), dr.zeros(weight, lanes), dr.zeros(mi.UInt32, lanes)
@@ -126,7 +128,8 @@ def no_photons(weight: Any, lanes: int) -> tuple[Photon, Reservoir]:
         mi.Bool(flag), mi.Float(number), mi.Float(number + 1.0), mi.Vector3f(vector), mi.Point3f(point),
         mi.Float(number), mi.Float(number),
     )  # fmt: skip
-    drawn = Reservoir(mi.Float(number), mi.Point3f(point), mi.Vector3f(vector), weight(power), mi.Float(number))
+    g = None if t.g_voxels is None else mi.Float(number)
+    drawn = Reservoir(mi.Float(number), mi.Point3f(point), mi.Vector3f(vector), weight(power), mi.Float(number), g)
     return photon, drawn
 
 
@@ -140,7 +143,7 @@ def collide(
 
     Returns (photon, reservoir, sums, rng): Dr.Jit's branches replace the objects that they change.
     """
-    chance, albedo = medium_at(t, photon.p, rng)
+    chance, albedo, g = medium_at(t, photon.p, rng)
     if dr.hint(rng.next() * rate < chance * t.majorant):
         sums.absorbed += type(sums.absorbed)(photon.w * (1.0 - albedo))
         photon.w *= albedo
@@ -150,7 +153,7 @@ def collide(
             if dr.hint(t.even, mode="scalar"):
                 assert cams is not None
                 if dr.hint(near):
-                    lobes = lobes_of(t, cams, photon.p, photon.d, photon.empty)
+                    lobes = lobes_of(t, cams, photon.p, photon.d, g, photon.empty)
             chance = lobes * counted(window, first_tag + photon.tag, photon.p)
             reservoir.seen += chance
             take = near & (rng.next() * reservoir.seen < chance)
@@ -159,11 +162,13 @@ def collide(
             power = photon.w / lobes if t.even and t.matched else photon.w
             reservoir.weight = dr.select(take, power, reservoir.weight)
             reservoir.lobes = dr.select(take, lobes, reservoir.lobes)
+            if dr.hint(t.g_voxels is not None, mode="scalar"):
+                reservoir.g = dr.select(take, g, reservoir.g)
         scattered = sampling.uniform_sphere(rng)
         photon.phase = mi.Float(sampling.UNIFORM)
         if dr.hint(not t.isotropic, mode="scalar"):
-            scattered = sampling.henyey_greenstein(rng, photon.d, t.g)
-            photon.phase = sampling.henyey_greenstein_pdf(dr.dot(photon.d, scattered), t.g)
+            scattered = sampling.henyey_greenstein(rng, photon.d, g)
+            photon.phase = sampling.henyey_greenstein_pdf(dr.dot(photon.d, scattered), g)
         photon.d = mi.Vector3f(scattered)
         photon.last = mi.Point3f(photon.p)
         photon.lobes = mi.Float(lobes)
@@ -273,7 +278,7 @@ def walk(
     counter = dr.zeros(mi.UInt32, 1)
     dr.eval(counter)
     rng = Rng(dr.zeros(mi.UInt32, lanes), dr.zeros(mi.UInt32, lanes))
-    photon, reservoir = no_photons(weight, lanes)
+    photon, reservoir = no_photons(t, weight, lanes)
     flight, rate = dr.zeros(mi.Float, lanes), dr.ones(mi.Float, lanes)
     running = dr.full(mi.Bool, True, lanes)
     stack = new_stack(t, cams is not None, lanes) if window is not None and window.splits else None
@@ -323,13 +328,16 @@ def walk(
                 while dr.hint(times > 0.0, label="connections"):
                     rng = connect_lobes(
                         t, cams, images, photon.tag, reservoir.point, reservoir.before, reservoir.weight,
-                        reservoir.lobes, rng,
+                        t.g if t.g_voxels is None else reservoir.g, reservoir.lobes, rng,
                     )  # fmt: skip
                     times -= 1.0
                 reservoir.seen = mi.Float(0.0)
             elif dr.hint(reservoir.seen > 0.0):
                 drawn = reservoir.weight * reservoir.seen
-                rng = connect_lobes(t, cams, images, photon.tag, reservoir.point, reservoir.before, drawn, 1.0, rng)
+                rng = connect_lobes(
+                    t, cams, images, photon.tag, reservoir.point, reservoir.before, drawn,
+                    t.g if t.g_voxels is None else reservoir.g, 1.0, rng,
+                )  # fmt: skip
                 reservoir.seen = mi.Float(0.0)
 
         # 5. The weight window: Russian roulette, splitting.

@@ -1,26 +1,29 @@
 """Media: sigma_t and albedo per wavelength on a grid, from a homogeneous base, a measured material or voxel files.
 
 Features are laid over the base in order, each mixed in linearly in sigma_s and sigma_a by the share of the voxel that
-it covers, so that a sheet thinner than a voxel keeps its optical thickness.
+it covers, so that a sheet thinner than a voxel keeps its optical thickness. Asymmetries are mixed by sigma_s: a voxel
+keeps the mean cosine of what it holds, and so its reduced scattering.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from disco_twin.object.features import coverage
-from disco_twin.object.voxels import read_voxels
+from disco_twin.object.voxels import Voxels, read_voxels
 from disco_twin.scene.materials import measured
-from disco_twin.scene.object_schema import Grid, HollowCore, Homogeneous, MediumConfig
+from disco_twin.scene.object_schema import Feature, Grid, HollowCore, Homogeneous, MediumConfig
 from hw.base.arrays import F32, F64
 from hw.base.errors import InputError
 
 KEY = "object.medium"
+MOST_G = 0.999  # of a voxel; beyond, single precision cannot tell a direction from another
 MOST_CELLS = 30_000_000  # 360 MB a wavelength while the medium is built
 
 
@@ -29,7 +32,9 @@ class Medium:
     """Cell-centred grid, trilinear in sigma_t and in sigma_s = sigma_t * albedo between centres, clamped outside them.
 
     sigma_t: (L, nz, ny, nx) float32 in 1/mm, homogeneous (L, 1, 1, 1); albedo: the same shape, 0 .. 1
-    low, high: (3,) x, y, z corners of the grid in mm, object frame; g: L asymmetries (Henyey-Greenstein)
+    low, high: (3,) x, y, z corners of the grid in mm, object frame; g: L asymmetries (Henyey-Greenstein), where they
+    vary the means over what scatters; g_voxels: (L, nz, ny, nx) float32 where they vary, else None. Between centres the
+    phase function is interpolated as sigma_s is.
     """
 
     sigma_t: F32
@@ -37,6 +42,22 @@ class Medium:
     low: F64
     high: F64
     g: tuple[float, ...]
+    g_voxels: F32 | None = None
+
+    def of_lasers(self, lasers: Sequence[int]) -> Medium:
+        """The medium for some of its wavelengths, in this order; one may come more than once."""
+        own = list(lasers)
+        g_voxels = None if self.g_voxels is None else self.g_voxels[own]
+        g = tuple(self.g[k] for k in own)
+        return Medium(self.sigma_t[own], self.albedo[own], self.low, self.high, g, g_voxels)
+
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """Laser indices that share sigma_t and g exactly, so that one walk serves them."""
+        alike: dict[tuple[object, ...], list[int]] = {}
+        for k, sigma_t in enumerate(self.sigma_t):
+            g = self.g[k] if self.g_voxels is None else self.g_voxels[k].tobytes()
+            alike.setdefault((sigma_t.tobytes(), g), []).append(k)
+        return tuple(tuple(group) for group in alike.values())
 
 
 def build_medium(config: MediumConfig, mesh: trimesh.Trimesh, wavelengths_nm: Sequence[float]) -> Medium:
@@ -64,11 +85,7 @@ def _grid(base: Grid, mesh: trimesh.Trimesh, lasers: int, g: tuple[float, ...]) 
     density = read_voxels(base.sigma_t_file, lasers, f"{key}.sigma_t_file")
     albedo: NDArray[np.floating]
     if base.albedo_file is not None:
-        albedo = read_voxels(base.albedo_file, lasers, f"{key}.albedo_file", highest=1.0).values
-        if albedo.shape[1:] != density.values.shape[1:]:
-            problem = f"the albedo grid is {albedo.shape[1:]}, sigma_t is {density.values.shape[1:]} (nz, ny, nx)"
-            remedy = "give both grids the same voxels"
-            raise InputError(problem, file=base.albedo_file, key=f"{key}.albedo_file", remedy=remedy)
+        albedo = _beside(density, base.albedo_file, lasers, "albedo", 0.0)
     else:
         assert base.albedo is not None  # the schema asks for exactly one of the two
         albedo = _column(_per_wavelength(base.albedo, lasers))
@@ -88,7 +105,28 @@ def _grid(base: Grid, mesh: trimesh.Trimesh, lasers: int, g: tuple[float, ...]) 
         raise InputError(problem, file=base.sigma_t_file, key=key, allowed=needed, remedy=remedy)
     shape = (lasers, *density.values.shape[1:])
     sigma_t, albedo = (np.broadcast_to(v, shape).astype(np.float32) for v in (density.values, albedo))
-    return Medium(sigma_t, albedo, low, high, g)
+    if base.g_file is None:
+        return Medium(sigma_t, albedo, low, high, g)
+    own = np.broadcast_to(_beside(density, base.g_file, lasers, "g", -MOST_G, MOST_G), shape)
+    return with_g(Medium(sigma_t, albedo, low, high, g), own)
+
+
+def _beside(density: Voxels, path: Path, lasers: int, what: str, lowest: float, highest: float = 1.0) -> F32:
+    """(C, nz, ny, nx) of another file with the voxels of sigma_t."""
+    key = f"{KEY}.base.{what}_file"
+    found = read_voxels(path, lasers, key, highest, lowest).values
+    if found.shape[1:] != density.values.shape[1:]:
+        problem = f"the {what} grid is {found.shape[1:]}, sigma_t is {density.values.shape[1:]} (nz, ny, nx)"
+        raise InputError(problem, file=path, key=key, remedy="give both grids the same voxels")
+    return found
+
+
+def with_g(medium: Medium, g: NDArray[np.floating]) -> Medium:
+    """The medium with asymmetries (L, nz, ny, nx) of its voxels, and their means weighted by sigma_s."""
+    g = g.astype(np.float32)
+    weight = np.asarray(medium.sigma_t * medium.albedo, np.float64).reshape(len(g), -1)
+    mean = [float(np.average(a.ravel(), weights=w if w.any() else None)) for a, w in zip(g, weight, strict=True)]
+    return replace(medium, g=tuple(mean), g_voxels=g)
 
 
 def _with_features(config: MediumConfig, base: Medium, mesh: trimesh.Trimesh) -> Medium:
@@ -106,6 +144,8 @@ def _with_features(config: MediumConfig, base: Medium, mesh: trimesh.Trimesh) ->
     sigma_t, albedo = (np.asarray(v, float) for v in (base.sigma_t, base.albedo))
     sigma_s = np.broadcast_to(sigma_t * albedo, (lasers, *shape)).copy()
     sigma_a = np.broadcast_to(sigma_t * (1 - albedo), (lasers, *shape)).copy()
+    varied = base.g_voxels is not None or any(np.any(_g_of(f, base) != base.g) for f in config.features)
+    forward = sigma_s * (_column(np.array(base.g)) if base.g_voxels is None else base.g_voxels) if varied else None
     centres = cell_centres(low, high, shape)
     cell = float(np.max((high - low) / np.array(shape[::-1])))
     for i, feature in enumerate(config.features):
@@ -120,9 +160,37 @@ def _with_features(config: MediumConfig, base: Medium, mesh: trimesh.Trimesh) ->
             a = _column(_per_wavelength(feature.albedo, lasers))
         sigma_s += weight * (t * a - sigma_s)
         sigma_a += weight * (t * (1 - a) - sigma_a)
+        if forward is not None:
+            forward += weight * (t * a * _column(_g_of(feature, base)) - forward)
     total = sigma_s + sigma_a
     ratio = np.divide(sigma_s, total, out=np.zeros_like(total), where=total > 0)
-    return Medium(total.astype(np.float32), ratio.astype(np.float32), low, high, base.g)
+    mixed = Medium(total.astype(np.float32), ratio.astype(np.float32), low, high, base.g)
+    if forward is None:
+        return mixed
+    parts = np.stack([np.array(base.g), *(_g_of(feature, base) for feature in config.features)])
+    own = [b"" if base.g_voxels is None else base.g_voxels[k].tobytes() for k in range(lasers)]
+    alike = [(mixed.sigma_t[k].tobytes(), own[k], *parts[:, k]) for k in range(lasers)]
+    return with_g(mixed, _mean_cosines(sigma_s, forward, alike))
+
+
+def _g_of(feature: Feature, base: Medium) -> F64:
+    """(L,) asymmetries of a feature."""
+    own = None if isinstance(feature, HollowCore) else feature.g
+    return _per_wavelength(base.g if own is None else own, len(base.g))
+
+
+def _mean_cosines(sigma_s: F64, forward: F64, lasers: Sequence[Hashable]) -> F64:
+    """(L, nz, ny, nx) asymmetries forward / sigma_s of mixed voxels.
+
+    Lasers of one name in `lasers` differ in albedo alone: they weigh the parts by their mean sigma_s, and so keep one
+    asymmetry and one walk.
+    """
+    out = np.empty_like(sigma_s)
+    for name in set(lasers):
+        own = [k for k, other in enumerate(lasers) if other == name]
+        total = sigma_s[own].mean(axis=0)
+        out[own] = np.divide(forward[own].mean(axis=0), total, out=np.zeros_like(total), where=total > 0)
+    return out
 
 
 def cell_centres(low: F64, high: F64, shape: tuple[int, ...]) -> F64:

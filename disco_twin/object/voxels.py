@@ -21,8 +21,11 @@ class Voxels:
     high: F64 | None
 
 
-def read_voxels(path: Path, lasers: int, key: str, highest: float = np.inf) -> Voxels:
-    """Read and check a grid: finite, 0 .. `highest`, one channel or one a laser. Raises: InputError for any other."""
+def read_voxels(path: Path, lasers: int, key: str, highest: float = np.inf, lowest: float = 0.0) -> Voxels:
+    """Read and check a grid: finite, `lowest` .. `highest`, one channel or one a laser.
+
+    Raises: InputError for any other.
+    """
     if path.suffix == ".npy":
         voxels = _read_npy(path, key)
     elif path.suffix == ".vol":
@@ -36,13 +39,14 @@ def read_voxels(path: Path, lasers: int, key: str, highest: float = np.inf) -> V
         problem = f"the grid has {len(values)} wavelengths for {lasers} lasers"
         remedy = "store (nz, ny, nx) for all lasers, or (lasers, nz, ny, nx)"
         raise InputError(problem, file=path, key=key, remedy=remedy)
-    for bad, what in ((~np.isfinite(values), "not a finite number"), (values < 0, "negative")):
+    too_low = "too small" if lowest else "negative"
+    for bad, what in ((~np.isfinite(values), "not a finite number"), (values < lowest, too_low)):
         if bad.any():
             problem = f"{_first(bad)} is {what} ({bad.sum()} in all)"
-            raise InputError(problem, file=path, key=key, allowed=">= 0", remedy=_CELL)
+            raise InputError(problem, file=path, key=key, allowed=f">= {lowest:g}", remedy=_CELL)
     if values.max() > highest:
         problem = f"{_first(values > highest)} is too large, the largest is {values.max():g}"
-        raise InputError(problem, file=path, key=key, allowed=f"0 .. {highest:g}", remedy=_CELL)
+        raise InputError(problem, file=path, key=key, allowed=f"{lowest:g} .. {highest:g}", remedy=_CELL)
     return voxels
 
 

@@ -7,10 +7,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    SerializerFunctionWrapHandler,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from disco_twin.scene.materials import MATERIALS
 from disco_twin.scene.polygons import inside, meeting
@@ -33,6 +40,20 @@ Direction = Annotated[Point, AfterValidator(_not_zero)]  # of any length
 Size = tuple[Positive, Positive, Positive]
 Turn = tuple[Angle, Angle, Angle]
 Polygon = Annotated[tuple[tuple[Length, Length], ...], Field(min_length=3, max_length=64)]  # x, y of its corners
+
+
+class Lean(Strict):
+    """Keys in `LEFT_OUT` that a scene does not state are no part of its dump.
+
+    Results are known by the dump: those of scenes that state no such key stay valid although the schema has grown.
+    """
+
+    LEFT_OUT: ClassVar[tuple[str, ...]] = ()
+
+    @model_serializer(mode="wrap")
+    def _stated(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        found: dict[str, Any] = handler(self)
+        return {key: value for key, value in found.items() if key not in self.LEFT_OUT or value not in (None, (), [])}
 
 
 # ---------------------------------------------------------------- shape
@@ -208,16 +229,19 @@ class Material(Strict):
         return self
 
 
-class Grid(Strict):
+class Grid(Lean):
     """Voxels from files: `.npy` (nz, ny, nx) or (lasers, nz, ny, nx), or Mitsuba's `.vol`.
 
     The corners are those of the outermost cells. A `.vol` file brings its own corners unless they are given here.
+    `g_file` holds an asymmetry for each voxel, in place of the medium's `g`.
     """
 
+    LEFT_OUT = ("g_file",)
     kind: Literal["grid"]
     sigma_t_file: NearbyFile  # 1/mm
     albedo_file: NearbyFile | None = None
     albedo: Albedo | None = None
+    g_file: NearbyFile | None = None
     low_mm: Point | None = None
     high_mm: Point | None = None
 
@@ -234,22 +258,28 @@ Base = Annotated[Homogeneous | Material | Grid, Field(discriminator="kind")]
 
 
 # ---------------------------------------------------------------- medium: features laid over the base, in order
-class Veins(Strict):
+class Scattering(Lean):
+    """What a feature is made of. `g` left out is the medium's."""
+
+    LEFT_OUT = ("g",)
+    sigma_t_per_mm: PerWavelength
+    albedo: Albedo
+    g: Asymmetry | tuple[Asymmetry, ...] | None = None
+
+
+class Veins(Scattering):
     """Thin wavy sheets, like the veins of marble: a foam of cells `spacing_mm` wide with walls `width_mm` thick."""
 
     kind: Literal["veins"]
-    sigma_t_per_mm: PerWavelength
-    albedo: Albedo
     spacing_mm: Positive = 12.0
     width_mm: Positive = 1.5
     seed: Annotated[int, Field(ge=0)] = 1
 
 
-class Crack(Strict):
+class Crack(Scattering):
     """A disc-shaped, slightly wavy sheet. With `sigma_t_per_mm = 0` it is a gap (of the object's own index)."""
 
     kind: Literal["crack"]
-    sigma_t_per_mm: PerWavelength
     albedo: Albedo = 0.0
     through_mm: Point = (0.0, 0.0, 0.0)
     normal: Direction = (1.0, 0.0, 0.0)
@@ -258,12 +288,10 @@ class Crack(Strict):
     waviness_mm: Annotated[float, Field(ge=0)] = 0.5
 
 
-class Layers(Strict):
+class Layers(Scattering):
     """Parallel layers: within each period along `direction`, the first `share` is this material."""
 
     kind: Literal["layers"]
-    sigma_t_per_mm: PerWavelength
-    albedo: Albedo
     direction: Direction = (0.0, 0.0, 1.0)
     period_mm: Positive
     share: Annotated[float, Field(gt=0, lt=1)] = 0.5
@@ -278,7 +306,7 @@ class HollowCore(Strict):
     radius_mm: Positive
 
 
-class Patch(Strict):
+class Patch(Scattering):
     """Opaque paint: the part of a ball around a surface point that lies less than `depth_mm` below the surface."""
 
     kind: Literal["patch"]
@@ -293,7 +321,7 @@ Feature = Annotated[Veins | Crack | Layers | HollowCore | Patch, Field(discrimin
 
 
 class MediumConfig(Strict):
-    """`base` with `features` laid over it in order.
+    """`base` with `features` laid over it in order. `g` is the base's.
 
     `cell_mm` is the edge of the voxels that features are sampled on; a grid base keeps its own voxels.
     """
@@ -307,6 +335,8 @@ class MediumConfig(Strict):
     def _reduced(self) -> MediumConfig:
         if isinstance(self.base, Material) and np.any(self.g):
             raise ValueError("a measured material states reduced scattering, it needs g = 0")
+        if isinstance(self.base, Grid) and self.base.g_file is not None and "g" in self.model_fields_set:
+            raise ValueError("give either g or base.g_file")
         return self
 
     def per_wavelength(self) -> Iterator[tuple[str, tuple[float, ...]]]:

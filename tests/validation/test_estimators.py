@@ -147,7 +147,7 @@ def test_medium_is_trilinear_in_the_mean() -> None:
     tables = Transport(obj, cells=32)._tables((0,))
     points = np.random.default_rng(5).uniform(-5.5, 5.5, (40, 3))
     n = 1 << 14
-    chance, albedo = medium_at(
+    chance, albedo, _ = medium_at(
         tables, mi.Point3f(np.repeat(points, n, axis=0).T.astype(np.float32)), streams(seed=10, n=40 * n)
     )
     sigma_t = np.array(chance, np.float64).reshape(40, n) * float(obj.medium.sigma_t.max())

@@ -132,7 +132,7 @@ def test_local_majorants_are_nowhere_exceeded() -> None:
     for _ in range(50):
         flight, bound = free_flight(tables, d, rate * 0.1, rng)  # long ones, to be cut
         end = p + d * dr.minimum(flight, 0.999_999 * flight)
-        chance, _ = medium_at(tables, end, rng)
+        chance, _, _ = medium_at(tables, end, rng)
         share = np.array(chance * tables.majorant / rate)
         assert share.max() <= 1.0 + 1e-6
         closest = max(closest, float(share.max()))

@@ -260,3 +260,79 @@ def test_vol_files_are_mitsubas(channels: int, tmp_path: Path) -> None:
     (tmp_path / "grid.vol").write_bytes(bytes(data[:-4]))
     with pytest.raises(InputError, match="its header states"):
         medium(folder=tmp_path, base=base)
+
+
+# ---------------------------------------------------------------- asymmetry
+LAYERS = {"kind": "layers", "sigma_t_per_mm": 3.0, "albedo": 0.5, "period_mm": 4.0}
+
+
+def test_a_feature_has_an_asymmetry_of_its_own() -> None:
+    """Voxels that it covers half keep the reduced scattering of both: lasers here differ in sigma_t."""
+    base = {**BASE, "sigma_t_per_mm": [1.0, 2.0, 3.0]}
+    own = {**LAYERS, "sigma_t_per_mm": [4.0, 5.0, 6.0], "g": [0.2, -0.3, 0.4]}
+    built = medium(base=base, g=0.8, features=[own])
+    assert built.g_voxels is not None and built.g_voxels.shape == built.sigma_t.shape
+    w = medium(features=[LAYERS])
+    w = share(w, 3.0)
+    for k, (t, a, g) in enumerate(zip((1.0, 2.0, 3.0), (0.9, 0.8, 0.7), (0.2, -0.3, 0.4), strict=True)):
+        reduced = (1 - w) * t * a * (1 - 0.8) + w * (t + 3.0) * 0.5 * (1 - g)
+        found = (built.sigma_t * built.albedo * (1 - built.g_voxels))[k]
+        np.testing.assert_allclose(found, reduced, rtol=1e-5)
+        scattered = (built.sigma_t * built.albedo)[k].astype(float)
+        assert built.g[k] == pytest.approx((scattered * built.g_voxels[k]).sum() / scattered.sum(), rel=1e-6)
+
+
+def test_a_feature_without_one_has_the_mediums() -> None:
+    built = medium(g=0.8, features=[LAYERS, {"kind": "hollow", "radius_mm": 2.0}, {**LAYERS, "g": 0.8}])
+    assert built.g_voxels is None
+    assert built.g == (0.8,) * 3
+
+
+def test_lasers_that_differ_in_albedo_keep_one_walk() -> None:
+    built = medium(g=0.8, features=[{**LAYERS, "albedo": [0.2, 0.5, 0.9], "g": 0.1}])
+    assert built.groups() == ((0, 1, 2),)
+    assert np.ptp(built.g_voxels) > 0.5
+    apart = medium(g=0.8, features=[{**LAYERS, "g": [0.1, 0.1, 0.2]}])
+    assert apart.groups() == ((0, 1), (2,))
+
+
+def test_a_grid_of_asymmetries(tmp_path: Path) -> None:
+    values = np.random.default_rng(0).uniform(-0.9, 0.9, size=(4, 5, 6))
+    np.save(tmp_path / "g.npy", values)
+    built = grid(tmp_path, np.ones((4, 5, 6)), g_file="g.npy")
+    np.testing.assert_allclose(built.g_voxels, np.broadcast_to(values, (3, 4, 5, 6)), rtol=1e-6)
+    assert built.groups() == ((0, 1, 2),)
+    assert built.of_lasers([2]).g_voxels.shape == (1, 4, 5, 6)
+    base = {"kind": "grid", "sigma_t_file": "sigma_t.npy", "g_file": "g.npy", "albedo": [0.9, 0.5, 0.1], **CORNERS}
+    hollow = {"kind": "hollow", "radius_mm": 3.0}
+    mixed = medium(folder=tmp_path, base=base, features=[hollow])
+    kept = mixed.sigma_t[0] > 0
+    np.testing.assert_allclose(mixed.g_voxels[:, kept], built.g_voxels[:, kept], rtol=1e-5)
+    assert mixed.groups() == ((0, 1, 2),)
+
+
+@pytest.mark.parametrize(
+    ("values", "more", "message"),
+    [
+        (bad(1.0), {}, r"base\.g_file.*z=0 y=0 x=0 .*too large.*-0\.999 \.\. 0\.999"),
+        (-bad(0.5), {}, r"too small.*>= -0\.999"),
+        (np.zeros((4, 5, 7)), {}, r"the g grid is \(4, 5, 7\)"),
+        (np.zeros((4, 5, 6)), {"g": 0.5}, r"either g or base\.g_file"),
+    ],
+)
+def test_bad_grids_of_asymmetries(values: np.ndarray, more: dict[str, Any], message: str, tmp_path: Path) -> None:
+    np.save(tmp_path / "sigma_t.npy", np.ones((4, 5, 6)))
+    np.save(tmp_path / "g.npy", values)
+    base = {"kind": "grid", "sigma_t_file": "sigma_t.npy", "albedo": 0.9, "g_file": "g.npy", **CORNERS}
+    with pytest.raises(InputError, match=message) as caught:
+        medium(folder=tmp_path, base=base, **more)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_key_that_is_left_out_leaves_no_trace() -> None:
+    """Results are known by the scene's dump: those of scenes from before `g` was a feature's stay valid."""
+    config = MediumConfig.model_validate({"base": BASE, "features": [LAYERS]})
+    assert "g" not in config.model_dump()["features"][0]
+    config = MediumConfig.model_validate({"base": BASE, "features": [{**LAYERS, "g": 0.0}]})
+    assert config.model_dump()["features"][0]["g"] == 0.0
+    assert MediumConfig.model_validate(config.model_dump()) == config
