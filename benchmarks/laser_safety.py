@@ -1,10 +1,16 @@
-"""How long does a laser go on after the program should have switched it off? Measured in the emulated devices.
+"""How long does light go on after the program should have put it out? Measured in the emulated devices.
 
-Every trial is a capture by a program of its own, with the real drivers and guards, through pseudo-terminals, in real
-time, that ends by one of the events: connecting to a laser that somebody left on; the end of the program; an exception;
-SIGINT, SIGTERM, SIGHUP, SIGQUIT; SIGKILL; the end of the program with a signal on its heels (`closing`). The emission
-of all three lasers is sampled every millisecond. Waits that have nothing to do with switching off (the start of
-emission, the boot of the board) are shortened.
+Every trial is a capture by a program of its own, with the real drivers and supervisor, through pseudo-terminals, in
+real time, that ends by one of the events: connecting to a laser that somebody left on; the end of the program; an
+exception; SIGINT, SIGTERM, SIGHUP, SIGQUIT; SIGKILL; SIGSTOP; the end of the program with a signal on its heels
+(`closing`); SIGINT while one laser is mute. It is dark when no laser emits and gates and floodlight are off, sampled
+every millisecond; the warning lamp has to be out 0.2 s later. All trials are made twice: alone, and beside four busy
+processes (keys with `busy_`).
+
+`worst_off_ms` counts from the event to darkness. It is the sum of ours, until the last command for darkness has left
+the supervisor (`worst_told_ms`), and of the emulated devices' own time from then on (`worst_emulator_ms`), which real
+devices spend in their firmware. `missed`: the light did not go out; `not_reached`: the program never got as far as the
+event. Waits that have nothing to do with it (emission, the board's boot, turns) are shortened.
 """
 
 from __future__ import annotations
@@ -17,8 +23,9 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -28,7 +35,10 @@ from typing import Any
 import numpy as np
 
 import disco_twin.firmware.omicron as omicron_firmware
+import disco_twin.firmware.turning as turning
 import hw.devices.mm_ard as board_driver
+from benchmarks.timed_supervisor import STAMPS
+from disco_twin.emulation.bench import LAMP_LINE
 from disco_twin.emulation.emulated_rig import Emulation
 from disco_twin.emulation.rig_file_of import rig_file_of
 from disco_twin.emulation.serve import Server
@@ -41,6 +51,7 @@ from hw.record import RawImage
 from hw.rig.connect import Connector
 from hw.rig.rig_rules import load_rig_file
 from hw.rig.serial_rig import SerialRig
+from hw.safety.ports import protocol_supervised
 from hw.serial.link import Link
 from pipeline.capture.loop import capture
 from pipeline.geometry.nominal_rig import CameraConfig
@@ -48,13 +59,18 @@ from pipeline.plan.plan import Plan
 
 SEED = 635532476
 LANES = 2
+BUSY = 4  # processes beside which all trials are made once more
 LIMIT_S = 0.1
 GIVEN_UP_S = 3.0
 START_S = 60.0
-CLOSING_S = 0.1  # within it comes the signal after a normal end; closing the rig takes 0.25 s
-SIGNALS = {name: signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGKILL")}
+CLOSING_S = 0.1  # within it comes the signal after a normal end
+MUTE = 1  # the laser that falls silent
+SIGNALS = {
+    "mute": signal.SIGINT,
+    **{n: signal.Signals[n] for n in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGKILL", "SIGSTOP")},
+}
 EVENTS = ("connect", "exit", "exception", "closing", *SIGNALS)
-EACH = 23  # trials
+TRIALS = 200
 RIG = TwinRigConfig(cameras=(CameraConfig(name="front", position_mm=(450, 60, 100), width=16, height=16),))
 PLAN = Plan(("front",), (0.0,), tuple(Aim(0, 1800 + k, 2000) for k in range(400)), lasers=3)
 
@@ -83,19 +99,26 @@ class Blink:
         return RawImage(np.zeros((16, 16), np.uint8), np.zeros((16, 16), np.uint16))
 
 
-def program(rig_toml: Path, folder: Path, how: str, images: int, told: Connection) -> None:
-    """A capture; says when it is under way (or, if it ends itself, when it does)."""
+def _prepare(stamps: Path) -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     sys.stderr = open(os.devnull, "w")  # noqa: SIM115 - its tracebacks are expected
     board_driver.BOOT_S = 0.05
+    os.environ[STAMPS] = str(stamps)
+    protocol_supervised.MODULE = "benchmarks.timed_supervisor"
+
+
+def program(rig_toml: Path, folder: Path, how: str, images: int, told: Connection) -> None:
+    """A capture; says when it is under way (or, if it ends itself, when it does)."""
+    _prepare(folder.with_suffix(".stamps"))
     rig = SerialRig(Connector(load_rig_file(rig_toml)), [Blink(how, images, told)], armed=True)
     capture(rig, PLAN, folder)
 
 
-def connecting(url: str, told: Connection) -> None:
+def connecting(url: str, stamps: Path, told: Connection) -> None:
     """Opens a laser's port, and does nothing else."""
-    link = Link(f"guard://{url}", 500000, "laser", WallClock())
+    _prepare(stamps)
+    link = Link(f"supervised://laser:{url}", 500000, "laser", WallClock())
     told.send(time.monotonic())
     link.close()
 
@@ -104,19 +127,20 @@ def connecting(url: str, told: Connection) -> None:
 
 
 class Watch:
-    """Samples the emission of all heads; `last_on` is when any of them emitted last."""
+    """Samples all devices but the mute one; `last_on` is when any of them was on last."""
 
-    def __init__(self, emulation: Emulation) -> None:
-        self.emulation, self.last_on = emulation, 0.0
+    def __init__(self, emulation: Emulation, mute: int | None) -> None:
+        self.emulation, self.mute, self.last_on = emulation, mute, 0.0
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     @property
     def on(self) -> bool:
-        """Whether any laser emits."""
-        now = time.monotonic()
-        return any(head.emission(now) > 0 for head in self.emulation.bench.heads)
+        """Whether any gate is open, the floodlight is on, or any laser emits."""
+        bench, now = self.emulation.bench, time.monotonic()
+        emits = (head.emission(now) > 0 for k, head in enumerate(bench.heads) if k != self.mute)
+        return bool(bench.board.lines & ~(1 << LAMP_LINE)) or any(emits)
 
     def _run(self) -> None:
         while not self._ended.wait(1e-3):
@@ -130,15 +154,21 @@ class Watch:
 
 @dataclass(frozen=True)
 class Trial:
-    """off_ms: from the event to the last light; None: it did not go out, or the program never got there."""
+    """off_ms: from the event to darkness, told_ms: to the last command for it; infinite if it did not come.
+
+    reached: the program got as far as the event. ended_s: from the event to the end of the program
+    """
 
     event: str
-    off_ms: float | None
+    reached: bool
+    off_ms: float = np.inf
+    told_ms: float = np.inf
+    ended_s: float = np.inf
 
 
 def watched(numbers: Sequence[int]) -> tuple[list[Trial], list[str]]:
     """The trials of one lane, one after the other, and what their bench saw that must never happen."""
-    omicron_firmware.EMISSION_S = 0.05
+    omicron_firmware.EMISSION_S, turning.SPEED_DEG_S = 0.05, 720.0
     emulation = emulated_devices(RIG, seed=1)
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])
@@ -151,43 +181,55 @@ def watched(numbers: Sequence[int]) -> tuple[list[Trial], list[str]]:
             for number in numbers:
                 event = EVENTS[number % len(EVENTS)]
                 if event != "connect":
-                    trials.append(Trial(event, _captured(context, emulation, folder, event, number)))
+                    trials.append(_captured(context, emulation, folder, event, number))
         for number in numbers:
             if EVENTS[number % len(EVENTS)] == "connect":
                 with Server(lasers, None) as sockets:
-                    trials.append(Trial("connect", _connected(context, emulation, sockets.urls, number)))
+                    trials.append(_connected(context, emulation, sockets.urls, folder, number))
     return trials, emulation.bench.hazards
 
 
-def _captured(context: Any, emulation: Emulation, folder: Path, event: str, number: int) -> float | None:
-    """Milliseconds of light after the end of a capture."""
+def _captured(context: Any, emulation: Emulation, folder: Path, event: str, number: int) -> Trial:
+    """A capture that ends."""
     random = np.random.default_rng((SEED, number))
-    images = int(random.integers(2, 20))
+    images, out = int(random.integers(2, 8)), folder / f"out{number}"
+    mute = MUTE if event == "mute" else None
+    firmware = emulation.cables[f"laser{MUTE}"].firmware
+    hear = firmware.feed
     ours, theirs = context.Pipe()
-    watch = Watch(emulation)
-    child = context.Process(target=program, args=(folder / "rig.toml", folder / f"out{number}", event, images, theirs))
+    watch = Watch(emulation, mute)
+    child = context.Process(target=program, args=(folder / "rig.toml", out, event, images, theirs))
     child.start()
     try:
         if not ours.poll(START_S):
-            return None
+            return Trial(event, reached=False)
         happened = float(ours.recv())
         if event in SIGNALS:
             time.sleep(float(random.uniform(0, 0.3)))
             if not watch.on:
-                return None
+                return Trial(event, reached=False)
+            if mute is not None:
+                setattr(firmware, "feed", lambda data, now: [])  # noqa: B010 - one laser falls silent
             happened = time.monotonic()
             os.kill(child.pid, SIGNALS[event])
         elif event == "closing":
             time.sleep(float(random.uniform(0, CLOSING_S)))
-            os.kill(child.pid, int(random.choice([SIGNALS[name] for name in SIGNALS if name != "SIGKILL"])))
-        return _until_dark(watch, happened)
+            ending = [SIGNALS[name] for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")]
+            os.kill(child.pid, int(random.choice(ending)))
+        off_ms, ended_s = _until_dark(watch, happened), np.inf
+        if event != "SIGSTOP":
+            child.join(10.0)
+            ended_s = time.monotonic() - happened
+        told_ms = _told(out.with_suffix(".stamps"), happened, None if mute is None else f"laser{mute}")
+        return Trial(event, True, off_ms, told_ms, ended_s)
     finally:
-        _ended(child)
+        setattr(firmware, "feed", hear)  # noqa: B010
+        _end(child)
         watch.close()
 
 
-def _connected(context: Any, emulation: Emulation, urls: dict[str, str], number: int) -> float | None:
-    """Milliseconds of light after the port of a laser that is on was opened (a socket, which knows when that is)."""
+def _connected(context: Any, emulation: Emulation, urls: dict[str, str], folder: Path, number: int) -> Trial:
+    """The port of a laser that is on is opened (a socket, which knows when that is)."""
     name = f"laser{number // len(EVENTS) % len(emulation.bench.heads)}"
     line, head = emulation.cables[name], emulation.bench.heads[int(name[-1])]
     opened: list[float] = []
@@ -200,58 +242,108 @@ def _connected(context: Any, emulation: Emulation, urls: dict[str, str], number:
     head.on_since, head.level, head.mode = time.monotonic() - 60, 1.0, int(Mode.BIAS | Mode.RELEASE)
     setattr(line, "opened", spy)  # noqa: B010 - a spy on one line
     ours, theirs = context.Pipe()
-    watch = Watch(emulation)
-    child = context.Process(target=connecting, args=(urls[name], theirs))
+    watch, stamps = Watch(emulation, None), folder / f"connect{number}.stamps"
+    child = context.Process(target=connecting, args=(urls[name], stamps, theirs))
     child.start()
     try:
         if not ours.poll(START_S) or not opened:
-            return None
-        return _until_dark(watch, opened[0])
+            return Trial("connect", reached=False)
+        return Trial("connect", True, _until_dark(watch, opened[0]), max(0.0, _told(stamps, opened[0] - 1.0) - 1e3))
     finally:
         setattr(line, "opened", before)  # noqa: B010
-        _ended(child)
+        _end(child)
         watch.close()
 
 
-def _until_dark(watch: Watch, happened: float) -> float | None:
-    """Milliseconds; None if it is not dark in time, or not dark for long."""
+def _told(stamps: Path, happened: float, but: str | None = None) -> float:
+    """Milliseconds until every device had been told to be dark, `but` one."""
+    first: dict[str, float] = {}
+    for row in stamps.read_text().splitlines():
+        at, url = row.split(" ", 1)
+        if float(at) >= happened and (but is None or not url.endswith(but)):
+            first.setdefault(url, 1e3 * (float(at) - happened))
+    return max(first.values(), default=np.inf)
+
+
+def _until_dark(watch: Watch, happened: float) -> float:
+    """Milliseconds; infinite if it is not dark in time, or not dark for long."""
     while watch.on:
         if time.monotonic() > happened + GIVEN_UP_S:
-            return None
+            return np.inf
         time.sleep(1e-3)
     time.sleep(0.2)
-    return None if watch.on else 1e3 * max(0.0, watch.last_on - happened)
+    return np.inf if watch.on or watch.emulation.bench.board.lines else 1e3 * max(0.0, watch.last_on - happened)
 
 
-def _ended(child: BaseProcess) -> None:
-    child.join(10)
+def _end(child: BaseProcess) -> None:
+    child.join(0.0)
     if child.is_alive():
         child.kill()
-        child.join()
+    child.join()
 
 
-def run(quick: bool) -> dict[str, Any]:
-    """207 trials, 23 of each event; two of each if quick."""
-    count = len(EVENTS) * (2 if quick else EACH)
+# ---- figures
+
+
+def _compute(parent: int) -> None:
+    while os.getppid() == parent:
+        sum(range(100_000))
+
+
+@contextmanager
+def busy(count: int) -> Iterator[None]:
+    """So many processes that compute."""
+    others = [multiprocessing.get_context("fork").Process(target=_compute, args=(os.getpid(),)) for _ in range(count)]
+    for other in others:
+        other.start()
+    try:
+        yield
+    finally:
+        for other in others:
+            other.kill()
+            other.join()
+
+
+def figures(count: int, others: int) -> dict[str, Any]:
+    """So many trials beside so many busy processes."""
     lanes = [range(lane, count, LANES) for lane in range(LANES)]
-    with ProcessPoolExecutor(LANES, mp_context=multiprocessing.get_context("spawn")) as pool:
+    load = os.getloadavg()[0]
+    with busy(others), ProcessPoolExecutor(LANES, mp_context=multiprocessing.get_context("spawn")) as pool:
         seen = list(pool.map(watched, lanes))
     trials = [trial for lane, _ in seen for trial in lane]
-    times = [t.off_ms for t in trials if t.off_ms is not None]
+    dark = [trial for trial in trials if np.isfinite(trial.off_ms)]
     rows = []
     for event in EVENTS:
-        own = [t.off_ms for t in trials if t.event == event and t.off_ms is not None]
+        own = [trial for trial in dark if trial.event == event]
+        ended = [trial.ended_s for trial in own if np.isfinite(trial.ended_s)]
         rows.append({
             "event": event,
-            "trials": sum(t.event == event for t in trials),
-            "median_ms": statistics.median(own) if own else 0.0,
-            "worst_ms": max(own, default=0.0),
+            "beside": others,
+            "trials": sum(trial.event == event for trial in trials),
+            "median_ms": statistics.median([t.off_ms for t in own]) if own else 0.0,
+            "worst_ms": max((t.off_ms for t in own), default=0.0),
+            "worst_told_ms": max((t.told_ms for t in own), default=0.0),
+            "worst_emulator_ms": max((max(0.0, t.off_ms - t.told_ms) for t in own), default=0.0),
+            "worst_end_s": max(ended, default=0.0),
         })  # fmt: skip
     return {
         "trials": len(trials),
-        "worst_off_ms": max(times, default=0.0),
-        "missed": len(trials) - len(times),
-        "over_limit": sum(t > 1e3 * LIMIT_S for t in times),
+        "worst_off_ms": max((t.off_ms for t in dark), default=0.0),
+        "worst_told_ms": max((t.told_ms for t in dark), default=0.0),
+        "worst_emulator_ms": max((max(0.0, t.off_ms - t.told_ms) for t in dark), default=0.0),
+        "missed": sum(t.reached and not np.isfinite(t.off_ms) for t in trials),
+        "not_reached": sum(not t.reached for t in trials),
+        "over_limit": sum(t.off_ms > 1e3 * LIMIT_S for t in dark),
+        "ctrl_c_end_s": max((t.ended_s for t in dark if t.event in ("SIGINT", "mute")), default=0.0),
+        "load_before": load,
         "hazards": [hazard for _, found in seen for hazard in found],
         "rows": rows,
     }
+
+
+def run(quick: bool) -> dict[str, Any]:
+    """200 trials alone and 200 beside four busy processes; two rounds of all events, and one, if quick."""
+    alone = figures(2 * len(EVENTS) if quick else TRIALS, 0)
+    beside = figures(len(EVENTS) if quick else TRIALS, BUSY)
+    rows = [*alone.pop("rows"), *beside.pop("rows")]
+    return alone | {f"busy_{key}": value for key, value in beside.items()} | {"rows": rows}

@@ -80,7 +80,7 @@ class Unplugged(DeviceError):
 
 
 class SwitchedOff(Unplugged):
-    """The guard of a laser's port has closed it: it is switching the laser off, or lost the port itself."""
+    """The supervisor has made everything dark, or is about to, and closed its ports."""
 
 
 class WrongDevice(DeviceError):

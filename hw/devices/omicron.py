@@ -189,7 +189,7 @@ class OmicronLaser:
         """No light, now and after a power cut: LOf, power 0, no autostart, operating release and bias off.
 
         What the laser does not obey, or cannot, keeps it from none of the others. One that answers nothing is left to
-        its guard, which insists: each of its questions would be waited for for nine seconds.
+        the supervisor, which insists: each of its questions would be waited for for nine seconds.
         """
         self.armed_mw = 0.0
         failed: list[DeviceError] = []
@@ -278,10 +278,6 @@ class OmicronLaser:
             self.link.write(b"\r?LOf\r")
         finally:
             self._subscriber(0.0)
-
-    def require_guard(self) -> None:
-        """Refuse to go on without the guard that would switch the laser off."""
-        self.link.require_guard()
 
     def require_power(self, tolerance: float) -> float:
         """Its own reading in mW; refused where two in a row are not its set point within this share.

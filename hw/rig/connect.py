@@ -25,7 +25,7 @@ from hw.interface import Aim, Camera
 from hw.rig.drivers import Board, Drivers, close_all
 from hw.rig.limits import LimitedBoard, PlacedTable, Subscriber
 from hw.rig.rig_file import EMULATED, DevicesFile, GenicamDevice, SensorDevice, ZaberDevice
-from hw.safety.ports.protocol_guard import PREFIX
+from hw.safety.ports.protocol_supervised import PREFIX, port_of
 from hw.safety.signals import uninterrupted
 from hw.serial.bytelog import ByteLog
 from hw.serial.link import Link
@@ -63,15 +63,18 @@ class Connector:
         self.clock = self.stand_ins.clock
 
     def _opened(
-        self, key: str, baud: int, device: str, name: str, driver: Callable[[Link], T], guarded: bool = False
+        self, key: str, baud: int, device: str, name: str, driver: Callable[[Link], T], supervised: str = ""
     ) -> T:
         """A driver on the link to its port, which is closed if the driver refuses the device.
 
-        key: of the port in the rig file; name: of the device among the stand-ins, and of its byte log
+        key: of the port in the rig file; name: of the device among the stand-ins, and of its byte log; supervised: the
+        kind of a device that the supervisor makes dark
         """
         port = self.file.ports()[key]
-        url = self.stand_ins.ports.get(name) if port == EMULATED else f"{PREFIX}{port}" if guarded else port
-        if url is None:
+        url = f"{PREFIX}{supervised}:{port}" if supervised else port
+        if port == EMULATED:
+            url = self.stand_ins.ports.get(name, "")
+        if not url:
             remedy = "name the device's port, or hand in what stands in for it"
             raise InputError("nothing emulates this device here", file=self.file.path, key=key, value=port,
                              remedy=remedy)  # fmt: skip
@@ -116,7 +119,7 @@ class Connector:
             device.title,
             f"laser{index}",
             lambda link: OmicronLaser(link, device.wavelength_nm, followed),
-            guarded=True,
+            supervised="laser",
         )
 
     def _require_settable(self, index: int, laser: OmicronLaser) -> None:
@@ -145,7 +148,7 @@ class Connector:
         device = self.file.board
         limits, subscriber = (device.limits_u, device.limits_v), self._subscriber(device.port)
         driver = partial(LimitedBoard, limits=limits, subscriber=subscriber)
-        return self._opened("board.port", mm_ard.BAUD, "mirror board", "board", driver)
+        return self._opened("board.port", mm_ard.BAUD, "mirror board", "board", driver, "board")
 
     def table(self) -> TurntableDriver:
         """The turntable's driver, in angles of the rig."""
@@ -265,7 +268,7 @@ def keys_named(file: DevicesFile) -> Iterator[None]:
     try:
         yield
     except DeviceError as error:
-        port = file.board.port if error.port == "board" else error.port.removeprefix(PREFIX)
+        port = file.board.port if error.port == "board" else port_of(error.port)
         if error.key is not None or port not in ports:
             raise
         raise error.set_by(ports[port], port, file.path) from error.__cause__

@@ -31,7 +31,6 @@ class LaserDriver(Protocol):
     def name(self) -> str: ...
     def arm(self, power_mw: float) -> None: ...
     def emit(self) -> None: ...
-    def require_guard(self) -> None: ...
     def require_power(self, tolerance: float) -> float:
         """The laser's own reading in mW, refused where it is not its set point within this share."""
 
@@ -106,7 +105,7 @@ def _each(clock: Clock, steps: Sequence[Callable[[], None]]) -> list[BaseExcepti
         try:
             step()
         except Unplugged as error:
-            quiet = error.known or isinstance(error, SwitchedOff)  # its guard was faster, and reports if it fails
+            quiet = error.known or isinstance(error, SwitchedOff)  # the supervisor was faster, and reports if it fails
             log.log(logging.INFO if quiet else logging.ERROR, "making the rig safe: %s", error)
         except Exception as error:  # noqa: BLE001 - the other devices matter more
             log.error("making the rig safe: %s", error)

@@ -5,7 +5,7 @@ The rig uses it for all of its lasers, the self-test for one after the other.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 from hw.base.clock import Clock
 from hw.base.errors import DeviceFault
@@ -14,9 +14,10 @@ from hw.interface import LaserReading
 from hw.rig.drivers import LaserDriver
 from hw.rig.rig_file import DARK_COUNTS, DevicesFile, LaserDevice
 from hw.rig.verified_board import VerifiedBoard
+from hw.safety.ports.protocol_supervised import require_supervisor
 from hw.safety.signals import raise_if_interrupted
 
-GUARDS_EVERY_S = 0.5  # while lasers warm up
+ASKED_EVERY_S = 0.5  # whether the supervisor is there, while lasers warm up
 
 
 def begin_emission(
@@ -32,19 +33,18 @@ def begin_emission(
     for index, laser in lasers.items():
         laser.arm(file.lasers[index].power_mw)
         laser.emit()
-    warm_up(clock, file.warm_up_s, lasers.values())
+    warm_up(clock, file.warm_up_s)
     return check_lasers(file, board, lasers)
 
 
-def warm_up(clock: Clock, seconds: float, lasers: Iterable[LaserDriver]) -> None:
-    """Wait while lasers that emit become steady, and end at once where the guard of one ends, or the program is to."""
+def warm_up(clock: Clock, seconds: float) -> None:
+    """Wait while lasers that emit become steady, and end at once where they were made dark, or the program is to."""
     left = seconds
     while left > 0:
-        clock.sleep(min(left, GUARDS_EVERY_S))
-        left -= GUARDS_EVERY_S
+        clock.sleep(min(left, ASKED_EVERY_S))
+        left -= ASKED_EVERY_S
         raise_if_interrupted()
-        for laser in lasers:
-            laser.require_guard()
+        require_supervisor()
 
 
 def check_lasers(file: DevicesFile, board: VerifiedBoard, lasers: Mapping[int, LaserDriver]) -> list[LaserReading]:

@@ -22,6 +22,7 @@ from hw.rig.drivers import Board, Closable, close_all, darken
 from hw.rig.emission import begin_emission, require_darkness, require_light
 from hw.rig.rig_file import EMULATED, DevicesFile, GenicamDevice, LaserDevice
 from hw.rig.verified_board import VerifiedBoard
+from hw.safety.ports.protocol_supervised import require_supervisor
 
 if TYPE_CHECKING:
     from hw.camera.genicam import GenicamCamera
@@ -62,7 +63,7 @@ C = TypeVar("C", bound=Closable)
 def _then(end: Callable[[], None]) -> Iterator[None]:
     """Something, and then this, whatever happened. What fails in it never takes the place of what went wrong before.
 
-    At Ctrl-C a laser's guard is faster than we are, and closing fails: that must not look like a test that failed,
+    At Ctrl-C the supervisor is faster than we are, and closing fails: that must not look like a test that failed,
     after which the next laser would be tried.
     """
     try:
@@ -265,7 +266,7 @@ def _test_laser(connect: Connector, board: Board, index: int) -> str:
         verified.aim(*file.board.centre)
         (reading,) = begin_emission(connect.clock, file, verified, {index: laser})
         verified.require_lines()
-        laser.require_guard()
+        require_supervisor()
         verified.open_gate(device.gate_line)
         counts, own_mw = _counts(verified, device), 1e3 * reading.own_w
         read_mw = 1e3 * require_light(counts, device, own_mw)

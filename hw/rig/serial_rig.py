@@ -22,6 +22,7 @@ from hw.rig.drivers import Drivers
 from hw.rig.emission import begin_emission, check_lasers, require_light
 from hw.rig.rig_file import DevicesFile, GenicamDevice
 from hw.rig.verified_board import VerifiedBoard
+from hw.safety.ports.protocol_supervised import require_supervisor
 from hw.safety.signals import uninterrupted
 
 T = TypeVar("T")
@@ -156,14 +157,6 @@ class SerialRig(Rig):
             return -1
         return next((i for i, laser in enumerate(self.file.lasers) if board.lit(laser.gate_line)), -1)
 
-    def require_guards(self) -> None:
-        """Refuse an image while nobody would switch a laser off, or after one was: asked at every image.
-
-        Raises: SwitchedOff.
-        """
-        for laser in self.drivers().lasers:
-            laser.require_guard()
-
     def require_dark(self, what: str) -> None:
         """Refuse to move anything while laser light is let out. Raises: Refused."""
         self.drivers()
@@ -192,7 +185,7 @@ class GatedLaser:
 
     def open_gate(self) -> None:
         """Let light out; refused while another gate is open. Raises: Refused, DeviceError."""
-        self.rig.require_guards()
+        require_supervisor()
         if self.rig.open_gate not in (-1, self.index):
             raise Refused(f"the gate of laser {self.rig.open_gate} is open: one laser at a time. Remedy: shut it first")
         self.rig.last_open = self.index
@@ -240,7 +233,7 @@ class AdcPhotodiode:
 
     def read(self) -> float:
         """Watts on the object; refused when they are not those that the laser was set to."""
-        self.rig.require_guards()
+        require_supervisor()
         laser, board = self.rig.last_open, self.rig.board()
         if laser < 0:
             return 0.0

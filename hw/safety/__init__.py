@@ -1,1 +1,1 @@
-"""Lasers go off when their program ends: ending signals, and guard processes that own the lasers' ports."""
+"""Light goes out when a program ends: the supervisor, which owns the ports of board and lasers; ending signals."""

@@ -17,8 +17,8 @@ import serial
 
 from hw.base.clock import Clock
 from hw.base.errors import DeviceError, Garbled, NoAnswer, SwitchedOff, Unplugged, WrongDevice
-from hw.safety.guard import FAILURES, GuardClosed
-from hw.safety.ports.protocol_guard import GuardedPort
+from hw.safety.ports.protocol_supervised import GoneDark
+from hw.safety.supervised_device import FAILURES
 from hw.serial.bytelog import ByteLog
 
 log = logging.getLogger(__name__)
@@ -49,9 +49,7 @@ TROUBLE = (
     | dict.fromkeys((errno.ENOTTY, errno.EISDIR, errno.ENOTDIR), NO_PORT)
     | {errno.ECONNREFUSED: NOBODY}
 )
-NUMBER = re.compile(r"\[Errno (\d+)\]|\((\d+), '")  # pyserial and guards give it as text alone
-
-GUARD_REMEDY = "see that the laser is off, then repeat the same command"
+NUMBER = re.compile(r"\[Errno (\d+)\]|\((\d+), '")  # pyserial and the supervisor give it as text alone
 
 for _ports in ("hw.serial.ports", "hw.safety.ports"):
     if _ports not in serial.protocol_handler_packages:
@@ -104,7 +102,7 @@ class Link:
             self._port = serial.serial_for_url(
                 url, baudrate=baud, timeout=SLICE_S, write_timeout=WRITE_TIMEOUT_S, exclusive=True
             )
-        except (*FAILURES, ValueError) as error:
+        except FAILURES as error:
             problem, remedy = _trouble(error)
             raise self._lost(f"cannot be opened: {problem}", error, remedy) from error
         self._note("open", b"")
@@ -154,17 +152,6 @@ class Link:
         """Nothing came in time."""
         return self.error(NoAnswer, f"did not answer {asked} within {limit_s:g} s", "check its cable and power")
 
-    def require_guard(self) -> None:
-        """Refuse to go on if the port had a guard and has none any more; it takes no word to the device.
-
-        Raises: SwitchedOff.
-        """
-        port: object = self._port
-        gone = port.gone() if isinstance(port, GuardedPort) else None
-        if gone:
-            self._note("!", gone.encode())
-            raise SwitchedOff(self.url, f"the port of {self.device}", f"is closed: {gone}", GUARD_REMEDY)
-
     def close(self) -> None:
         """Give the port back and end the log; never raises, may be called twice."""
         try:
@@ -181,7 +168,7 @@ class Link:
             self._log.note(self.clock.now(), mark, data)
 
     def _lost(self, what: str, error: Exception, remedy: str = REMEDY) -> Unplugged:
-        kind = SwitchedOff if isinstance(error, GuardClosed) else Unplugged
+        kind = SwitchedOff if isinstance(error, GoneDark) else Unplugged
         lost = kind(self.url, f"the port of {self.device}", what, remedy)
         lost.known, self._gone = self._gone, True
         self._note("!", str(error).encode())
@@ -190,7 +177,7 @@ class Link:
 
 def _why(error: Exception) -> str:
     """Why an open port fails: what systems and libraries call it goes into the byte log."""
-    if isinstance(error, GuardClosed):
+    if isinstance(error, GoneDark):
         return str(error)
     if isinstance(error, serial.SerialTimeoutException):
         return f"none were taken in {WRITE_TIMEOUT_S:g} s"

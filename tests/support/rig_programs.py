@@ -11,8 +11,8 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from guard_fakes import guards_of
 from rig_fakes import SCENE, quick
+from supervisor_fakes import end_supervisors, supervisors_of
 from twin_fakes import RIG
 
 from disco_twin.emulation.bench import FLOOD_LINE, LAMP_LINE
@@ -53,6 +53,9 @@ main()
 """
 
 
+STARTED: list[int] = []  # programs of the test that runs
+
+
 Bench = tuple[Emulation, Server, Path]
 
 
@@ -66,10 +69,11 @@ def devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
         (tmp_path / "rig.toml").write_text(rig_file_of(ONE_LASER, {name: urls[name] for name in ("laser0", "board")}))
         (tmp_path / "scene.toml").write_text(ONE_LASERS_SCENE)
         yield emulated, server, tmp_path / "rig.toml"
-        for url in urls.values():
-            for guard in guards_of(port=url):  # of a laser that never came back it goes on for ten minutes
+        end_supervisors()
+        while STARTED:
+            for supervisor in supervisors_of(STARTED.pop()):  # of a laser that never came back: ten minutes
                 with suppress(ProcessLookupError):
-                    os.kill(guard, signal.SIGKILL)
+                    os.kill(supervisor, signal.SIGKILL)
 
 
 def at_pattern(emulated: Emulation, wanted: Callable[[int], bool], action: Callable[[], None]) -> None:
@@ -87,7 +91,9 @@ def at_pattern(emulated: Emulation, wanted: Callable[[int], bool], action: Calla
 
 def started(words: list[str]) -> subprocess.Popen[str]:
     command = [sys.executable, "-c", PROGRAM, *words]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    STARTED.append(process.pid)
+    return process
 
 
 def said(err: str) -> str:

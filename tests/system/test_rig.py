@@ -1,4 +1,4 @@
-"""A laboratory's day without a renderer: drivers, guards, a GigE Vision camera; killed in the middle, and resumed."""
+"""A laboratory's day without a renderer: drivers, supervisor, a GigE Vision camera; killed half-way, and resumed."""
 
 from __future__ import annotations
 
@@ -192,19 +192,19 @@ def test_capture_killed_resumed_and_looked_at(rig: Path, camera: Any, tmp_path: 
     assert {row.split(",")[0] for row in rows[1:]} == {"0", "1"} and all(",0.01,0.01,0.0" in row for row in rows[1:])
 
 
-def test_a_guard_that_is_killed_in_the_middle_of_a_scan(rig: Path, camera: Any, tmp_path: Path) -> None:
+def test_a_supervisor_that_is_killed_in_the_middle_of_a_scan(rig: Path, camera: Any, tmp_path: Path) -> None:
     """Rationale: nobody would switch the laser off then. Expected: dark, one line that says so; nothing lost."""
     scene, out = tmp_path / "scene.toml", tmp_path / "out"
     change(rig, *TOO_NOISY_TO_TELL)
     process = begun(rig, tmp_path)
     listed = ["ps", "-ww", "-o", "pid=,args=", "--ppid", str(process.pid)]
     children = subprocess.run(listed, capture_output=True, text=True, check=True).stdout.splitlines()
-    (guard,) = [int(line.split()[0]) for line in children if "hw.safety.guard" in line]
-    os.kill(guard, signal.SIGKILL)
+    (supervisor,) = [int(line.split()[0]) for line in children if "hw.safety.supervisor" in line]
+    os.kill(supervisor, signal.SIGKILL)
     status, said = finish(process)
     assert not emits(rig)
-    reason = "its guard process was killed (status -9); another one switches the laser off"
-    assert status == 2 and reason in said and "Remedy: see that the laser is off" in said, said
+    reason = "its supervisor was killed or stopped (-9); another one makes everything dark"
+    assert status == 2 and reason in said and "Remedy: see that every laser is off" in said, said
     assert "Traceback" not in said
     with StreamReader(out / "capture") as stream:
         before = [stream.read(i).charge for i in range(len(stream))]

@@ -1,1 +1,1 @@
-"""Ports that belong to a guard process, in pyserial's language: `guard://PORT` (see `protocol_guard`)."""
+"""Ports that the supervisor lends, in pyserial's language: `supervised://KIND:PORT` (`protocol_supervised`)."""

@@ -36,7 +36,7 @@ def traps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ("command", "says"),
     [
         (code_command("import hw, pipeline, disco_twin, numpy; print(hw.__path__)"), str(Path(hw.__path__[0]))),
-        (module_command("hw.safety.guard"), "IndexError"),  # it wants arguments
+        (module_command("hw.safety.supervisor"), "IndexError"),  # it wants arguments
     ],
 )
 def test_children_import_nothing_from_the_current_folder(traps: Path, command: list[str], says: str) -> None:

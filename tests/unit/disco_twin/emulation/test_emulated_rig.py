@@ -139,7 +139,7 @@ def test_what_fails_while_lasers_warm_up_leaves_nothing_on(error: type[BaseExcep
     """Without the capture loop, which would make the rig safe once more."""
     emulated = emulation()
     rig, sleep = emulated.serial_rig(), emulated.clock.sleep
-    rig.file = rig.file.model_copy(update={"warm_up_s": 0.4375})  # less than the guards are asked at
+    rig.file = rig.file.model_copy(update={"warm_up_s": 0.4375})  # less than the supervisor is asked after
     lit = []
 
     def disturbed(seconds: float) -> None:

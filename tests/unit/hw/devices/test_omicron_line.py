@@ -149,7 +149,7 @@ def test_a_failed_step_of_switching_off_does_not_stop_the_others(deaf: bytes) ->
 
 @pytest.mark.parametrize("told", [False, True])
 def test_a_silent_laser_is_closed_in_the_time_of_one_question(told: bool) -> None:
-    """Its adapter lives, it hears nothing. Expected: three attempts at LOf, then the port is its guard's."""
+    """Its adapter lives, it hears nothing. Expected: three attempts at LOf, then the port is the supervisor's."""
     bench = LaserBench()
     laser = emitting(bench)
     bench.line.firmware.feed = lambda data, now: []  # type: ignore[method-assign]

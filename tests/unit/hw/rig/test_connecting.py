@@ -27,7 +27,7 @@ LIT = 1 << LAMP_LINE | 1 << FLOOD_LINE | 0b11
 
 
 def left_on() -> Emulation:
-    """Lasers, gates and lamps as a program that was killed together with its guards leaves them."""
+    """Lasers, gates and lamps as a program that was killed together with its supervisor leaves them."""
     emulated = Emulation(TwinRig(RIG, Glow(), seed=5))
     emulated.bench.board.set_pattern(LIT)
     for head in emulated.bench.heads:

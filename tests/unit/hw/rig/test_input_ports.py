@@ -26,7 +26,7 @@ from hw.rig.selftest import probe
 
 
 def test_ports_that_cannot_be_opened_name_key_and_remedy(tmp_path: Path) -> None:
-    """Laser 1's port is opened by its guard process, the turntable's by the program itself."""
+    """Laser 1's port is opened by the supervisor, the turntable's by the program itself."""
     master, slave = os.openpty()
     held = os.open(os.ttyname(slave), os.O_RDWR)
     fcntl.flock(held, fcntl.LOCK_EX)  # as another program's pyserial does
@@ -109,7 +109,7 @@ def test_one_device_under_two_names_is_refused(tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.parametrize(
-    "port", ["hwgrep://(", "loop://", "socket://", "rfc2217://x", "guard:///dev/x", "nonsense://x"]
+    "port", ["hwgrep://(", "loop://", "socket://", "rfc2217://x", "supervised://laser:/dev/x", "nonsense://x"]
 )
 def test_other_ports_than_paths_and_sockets_are_refused(tmp_path: Path, says: Says, port: str) -> None:
     path = rig_file(tmp_path, turntable=port)

@@ -69,7 +69,7 @@ def test_probe_and_selftest_of_served_devices(
 
 
 def test_ctrl_c_in_a_selftest_does_not_go_on_to_the_next_laser(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The guard closes its port at the signal, so that closing the laser fails."""
+    """The supervisor closes its port at the signal, so that closing the laser fails."""
     monkeypatch.setattr("hw.devices.mm_ard.BOOT_S", 0.05)
     tried, told = [], []
 
@@ -90,7 +90,7 @@ def test_ctrl_c_in_a_selftest_does_not_go_on_to_the_next_laser(tmp_path: Path, m
 
         def close(self) -> None:
             if tried:
-                raise SwitchedOff("guard://laser0", "the port of the laser", "is closed", "none")
+                raise SwitchedOff("supervised://laser:laser0", "the port of the laser", "is closed", "none")
 
     monkeypatch.setattr("hw.rig.connect.Connector.omicron", lambda self, index: LaserDriver())
     with served(RIG, 3, tmp_path / "ports") as path:

@@ -233,7 +233,7 @@ def test_the_emulated_rig_equals_the_direct_twin(tmp_path: Path, direct: Path) -
 
 @pytest.fixture
 def devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Emulation, dict[str, str]]]:
-    """Devices that are real as far as the rig knows: on pseudo-terminals, in real time, behind a guard."""
+    """Devices that are real as far as the rig knows: on pseudo-terminals, in real time, behind a supervisor."""
     monkeypatch.setattr("disco_twin.firmware.omicron.EMISSION_S", 0.05)  # nothing is learnt from waiting
     monkeypatch.setattr("disco_twin.firmware.turning.SPEED_DEG_S", 720.0)
     (tmp_path / "ports").mkdir()

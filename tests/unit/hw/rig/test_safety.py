@@ -16,7 +16,6 @@ from disco_twin.emulation.emulated_rig import open_scene_rig
 from disco_twin.emulation.rig_file_of import rig_file_of
 from disco_twin.emulation.twin_rig import TwinRig
 from hw.base.errors import DeviceFault, DiscoError, Refused, SwitchedOff, Unplugged
-from hw.devices.omicron import OmicronLaser
 from hw.interface import gate_open
 from hw.rig.rig_rules import load_rig_file
 from hw.rig.serial_rig import SerialRig
@@ -232,20 +231,20 @@ def test_an_opening_whose_answer_was_lost_is_not_repeated_before_aiming_anew() -
     assert any(d[:1] == b"\x03" for d in sent[openings[0] : openings[1]])
 
 
-def test_no_gate_opens_and_no_image_counts_without_a_guard() -> None:
-    """Asked of every laser, not only of the one whose gate opens: all of them emit."""
+def test_no_gate_opens_and_no_image_counts_once_everything_was_made_dark(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lasers are real, the board is emulated: it would go on answering."""
     emulated = emulation()
 
     def gone() -> None:
-        raise SwitchedOff("guard://laser2", "the port of laser 476 nm", "is closed: its guard ended", "none")
+        raise SwitchedOff("supervisor", "the rig", "is dark: the program was stopped", "none")
 
-    with emulated.serial_rig() as rig:
-        rig.drivers().lasers[2].require_guard = gone  # type: ignore[method-assign]
-        with pytest.raises(SwitchedOff, match="its guard ended"):
+    with emulated.serial_rig() as rig, monkeypatch.context() as dark:
+        dark.setattr("hw.rig.serial_rig.require_supervisor", gone)
+        with pytest.raises(SwitchedOff, match="the program was stopped"):
             rig.lasers[0].open_gate()
         assert not emulated.bench.board.lines & 7
     with emulated.serial_rig() as rig, pytest.raises(SwitchedOff), gate_open(rig.lasers[0]):  # noqa: PT012 - a gate block
-        rig.drivers().lasers[2].require_guard = gone  # type: ignore[method-assign]
+        monkeypatch.setattr("hw.rig.serial_rig.require_supervisor", gone)
         rig.photodiode.read()
     assert emulated.bench.light() == [] and emulated.bench.hazards == []
 
@@ -330,17 +329,17 @@ def test_ctrl_c_while_the_rig_is_made_safe_leaves_no_device_open(step: str) -> N
     assert len(closed) == 3
 
 
-def test_a_guard_that_ends_while_lasers_warm_up_ends_it_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_supervisor_that_ends_while_lasers_warm_up_ends_it_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     emulated = emulation()
     rig = emulated.serial_rig()
     rig.file = rig.file.model_copy(update={"warm_up_s": 3600.0})
     begun = emulated.clock.now()
 
-    def require_guard(self: OmicronLaser) -> None:
+    def gone() -> None:
         if emulated.clock.now() - begun > 100:
-            raise SwitchedOff("port", "laser", "its guard process was killed", "see to it")
+            raise SwitchedOff("supervisor", "the rig", "is dark: it was killed", "see to it")
 
-    monkeypatch.setattr(OmicronLaser, "require_guard", require_guard)
+    monkeypatch.setattr("hw.rig.emission.require_supervisor", gone)
     with pytest.raises(SwitchedOff), rig:
         pass
     assert emulated.clock.now() - begun < 110

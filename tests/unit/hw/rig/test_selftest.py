@@ -1,6 +1,6 @@
-"""The armed self-test with a device that falls silent or a guard that ends: how long light is let out then.
+"""The armed self-test with a device that falls silent or a supervisor that is killed: how long light is let out then.
 
-Real drivers and guards, emulated devices on pseudo-terminals in real time.
+Real drivers and supervisors, emulated devices on pseudo-terminals in real time.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import time
 from types import SimpleNamespace
 
 import pytest
-from guard_fakes import guards_of
 from rig_fakes import emulation
 from rig_programs import GATE, Bench, devices, started
+from supervisor_fakes import supervisors_of
 
 from hw.base.errors import DeviceFault, InputError
 from hw.devices.omicron import OmicronLaser
@@ -37,7 +37,7 @@ def test_the_gate_is_shut_before_a_laser_that_falls_silent_is_told_to_go_off(
 
     def fall_silent(head: OmicronLaser) -> None:
         lines.append(emulated.bench.board.lines & GATE)
-        with monkeypatch.context() as silent:  # it is back when the driver has given it up, for the guard
+        with monkeypatch.context() as silent:  # it is back when the driver has given it up, for the supervisor
             silent.setattr(emulated.cables["laser0"].firmware, "feed", lambda data, now: [])
             stop(head)
 
@@ -108,7 +108,7 @@ def test_a_photodiode_that_is_not_dark_is_named(devices: Bench, monkeypatch: pyt
     assert {f.name: f for f in selftest(load_rig_file(rig), None, armed=False)}["photodiode, dark"].good
 
 
-def test_a_guard_that_ends_in_the_warm_up_ends_it(devices: Bench) -> None:
+def test_a_supervisor_that_is_killed_in_the_warm_up_ends_it(devices: Bench) -> None:
     """Rationale: nobody would switch the laser off. Expected: off long before the minute of the warm-up is over."""
     emulated, _, rig = devices
     rig.write_text(rig.read_text().replace("warm_up_s = 0.0", "warm_up_s = 60.0"))
@@ -119,10 +119,8 @@ def test_a_guard_that_ends_in_the_warm_up_ends_it(devices: Bench) -> None:
         time.sleep(0.02)
     time.sleep(0.7)
     assert head.on_since is not None
-    guards = guards_of(process.pid)
-    assert guards
-    for guard in guards:
-        os.kill(guard, signal.SIGKILL)
+    (supervisor,) = supervisors_of(process.pid)
+    os.kill(supervisor, signal.SIGKILL)
     begun = time.monotonic()
     out, err = process.communicate(timeout=40)
     assert time.monotonic() - begun < 20.0 and head.on_since is None

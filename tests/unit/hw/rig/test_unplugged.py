@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 import serial
-from guard_fakes import guards_of
 from rig_fakes import SCENE, quick
 from rig_programs import ONE, PROGRAM, at_pattern
+from supervisor_fakes import supervisors_of
 
 from disco_twin.emulation.bench import LAMP_LINE
 from disco_twin.emulation.rig_file_of import rig_file_of
@@ -21,7 +21,7 @@ from hw.base.clock import WallClock
 from hw.base.errors import Unplugged
 from hw.serial.link import Link
 
-RAW = re.compile(r"Errno|multiple access|write failed|returned no data|guard://")
+RAW = re.compile(r"Errno|multiple access|write failed|returned no data|supervised://")
 
 
 def test_all_cables_pulled_is_a_line_a_device_and_the_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -34,7 +34,7 @@ def test_all_cables_pulled_is_a_line_a_device_and_the_error(tmp_path: Path, monk
         (tmp_path / "rig.toml").write_text(rig_file_of(ONE, server.urls))
         scene, out_folder, rig = (str(tmp_path / name) for name in ("scene.toml", "out", "rig.toml"))
         words = ["capture", scene, "--out", out_folder, "--rig", rig, "--arm"]
-        with (tmp_path / "said").open("w") as sink:  # guards live longer than their program, and keep its outlet
+        with (tmp_path / "said").open("w") as sink:  # its supervisor lives longer, and keeps its outlet
             process = subprocess.Popen([sys.executable, "-c", PROGRAM, *words], stdout=sink, stderr=sink)
         at_pattern(emulated, lambda pattern: pattern == 1 << LAMP_LINE | 1, lambda: pulled.append("now"))
         try:
@@ -46,9 +46,9 @@ def test_all_cables_pulled_is_a_line_a_device_and_the_error(tmp_path: Path, monk
         finally:
             process.kill()
             for name in emulated.cables:
-                server.plug(name)  # the guards find their lasers again, and end
+                server.plug(name)  # the supervisor finds board and lasers again, and ends
             end = time.monotonic() + 10.0
-            while any(guards_of(port=url) for url in server.urls.values()) and time.monotonic() < end:
+            while supervisors_of(process.pid) and time.monotonic() < end:
                 time.sleep(0.05)
     out = (tmp_path / "said").read_text()
     said = [line for line in out.splitlines() if "ports/" in line or "disco-twin:" in line]

@@ -124,7 +124,7 @@ def test_errors_of_a_rig_that_runs_name_file_key_and_port(tmp_path: Path) -> Non
         keys_named(file),
     ):
         raise problem
-    laser = SwitchedOff("guard:///dev/ttyUSB7", "the port of laser 635 nm", "is closed", "none")
+    laser = SwitchedOff("supervised://laser:/dev/ttyUSB7", "the port of laser 635 nm", "is closed", "none")
     path.write_text(rig_file_of(RIG, {"laser0": "/dev/ttyUSB7"}))
     with (
         pytest.raises(SwitchedOff, match=rf"^{path}: lasers\[0\].port = '/dev/ttyUSB7': "),

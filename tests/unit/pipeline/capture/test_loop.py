@@ -195,10 +195,10 @@ last_meta = StreamWriter.last_meta
 
 
 def test_a_device_that_fails_on_the_way_out_does_not_hide_the_signal(tmp_path: Path) -> None:
-    """The guard of a laser closes its port at the signal, and then nobody can talk to the laser any more."""
+    """The supervisor closes the ports at the signal, and then nobody can talk to the laser any more."""
 
-    class Guarded(FakeRig):
-        def __enter__(self) -> Guarded:
+    class Supervised(FakeRig):
+        def __enter__(self) -> Supervised:
             super().__enter__()
             try:
                 os.kill(os.getpid(), signal.SIGTERM)
@@ -206,7 +206,7 @@ def test_a_device_that_fails_on_the_way_out_does_not_hide_the_signal(tmp_path: P
                 raise DiscoError("the laser's port is closed")
 
     with pytest.raises(Interrupted, match="stopped: 0 of 48"):
-        capture(Guarded(PLAN), PLAN, tmp_path)
+        capture(Supervised(PLAN), PLAN, tmp_path)
     with pytest.raises(DiscoError, match="port is closed"):
         capture(FakeRig(PLAN, on_expose=after(3, closed_port)), PLAN, tmp_path)
 

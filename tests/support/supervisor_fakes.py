@@ -18,7 +18,7 @@ from contextlib import ExitStack, suppress
 import pytest
 
 from hw.base.clock import WallClock
-from hw.safety.ports.protocol_guard import GuardedPort
+from hw.safety.ports.protocol_supervised import LIFELINE, SupervisedPort
 from hw.serial.link import Link
 
 LIMIT_S = 1.0  # on a busy machine; the benchmark measures the 100 ms
@@ -94,7 +94,7 @@ def wait(laser: Laser, on: bool, limit_s: float = 5.0) -> None:
         time.sleep(0.002)
 
 
-def said_by(port: GuardedPort) -> bytes:
+def said_by(port: SupervisedPort) -> bytes:
     """Its next answer, without the CR."""
     got, end = b"", time.monotonic() + 2.0
     while not (plain := re.sub(rb"\$[^\r]*\r|\0", b"", got)).endswith(b"\r"):
@@ -105,9 +105,8 @@ def said_by(port: GuardedPort) -> bytes:
 
 PROGRAM = """
 import signal, sys, threading, time
-from hw.safety.guard import GuardClosed
-from hw.safety.ports.protocol_guard import GuardedPort
-port = GuardedPort("guard://" + sys.argv[1], baudrate=500000, timeout=0.5, write_timeout=1)
+from hw.safety.ports.protocol_supervised import SupervisedPort
+port = SupervisedPort("supervised://laser:" + sys.argv[1], baudrate=500000, timeout=0.5, write_timeout=1)
 port.write(b"?LOn\\r")
 if sys.argv[2] == "deaf":  # a main thread that never gets to its signal handlers: one long step of C
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
@@ -142,28 +141,32 @@ def run() -> Iterator[Run]:
     """
     started: list[subprocess.Popen[str]] = []
 
-    def start(laser: Laser, how: str, text: str = PROGRAM) -> subprocess.Popen[str]:
+    def start(laser: Laser | None, how: str, text: str = PROGRAM) -> subprocess.Popen[str]:
         program = subprocess.Popen(
-            [sys.executable, "-c", text, laser.port, how], start_new_session=True,
+            [sys.executable, "-c", text, *([] if laser is None else [laser.port]), how], start_new_session=True,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         started.append(program)
         assert program.stdout is not None and program.stdout.readline() == "on\n"
-        wait(laser, on=True)
+        if laser is not None:
+            wait(laser, on=True)
         return program
 
     yield start
     for program in started:
         with program:  # closes its pipes
             program.kill()
+        for supervisor in supervisors_of(program.pid):
+            with suppress(ProcessLookupError):
+                os.kill(supervisor, signal.SIGKILL)
 
 
 @pytest.fixture
 def lasers() -> Iterator[Callable[..., Laser]]:
-    """Lasers that end with the test, whatever becomes of it, and their guards with them.
+    """Lasers that end with the test, whatever becomes of it, and their supervisors with them.
 
-    A guard that its laser never answered goes on for ten minutes, and would meet the next test's terminal under the
-    same name: it would lock it, and say LOf into it.
+    One that its laser never answered goes on for ten minutes, and would meet the next test's terminal under the same
+    name: it would lock it, and say LOf into it.
     """
     made: list[Laser] = []
 
@@ -172,23 +175,21 @@ def lasers() -> Iterator[Callable[..., Laser]]:
         return made[-1]
 
     yield make
+    end_supervisors()
     for laser in made:
-        for guard_of_it in guards_of(port=laser.port):
-            with suppress(ProcessLookupError):
-                os.kill(guard_of_it, signal.SIGKILL)
         laser.close()
 
 
-Opening = Callable[[Laser], GuardedPort]
+Opening = Callable[[Laser], SupervisedPort]
 
 
 @pytest.fixture
 def ports() -> Iterator[Opening]:
-    """Opens guarded ports, and closes those that a test that fails leaves open."""
+    """Opens supervised ports, and closes those that a test that fails leaves open."""
     with ExitStack() as left:
 
-        def open_port(laser: Laser) -> GuardedPort:
-            port = GuardedPort("guard://" + laser.port, baudrate=500000, timeout=0.5, write_timeout=1)
+        def open_port(laser: Laser) -> SupervisedPort:
+            port = SupervisedPort("supervised://laser:" + laser.port, baudrate=500000, timeout=0.5, write_timeout=1)
             left.callback(port.close)
             return port
 
@@ -197,14 +198,24 @@ def ports() -> Iterator[Opening]:
 
 @pytest.fixture
 def link(laser: Laser) -> Iterator[Link]:
-    """A guarded link to the laser."""
-    made = Link("guard://" + laser.port, 500000, "laser 635 nm", WallClock())
+    """A supervised link to the laser."""
+    made = Link("supervised://laser:" + laser.port, 500000, "laser 635 nm", WallClock())
     yield made
     made.close()
 
 
-def guards_of(pid: int | None = None, port: str = "") -> list[int]:
-    """The guards that a program has started, or all of a port."""
-    found = subprocess.run(["ps", "-ww", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True)
-    lines = [line.split() for line in found.stdout.splitlines() if f"-m hw.safety.guard {port}" in line]
-    return [int(own) for own, parent, *words in lines if pid in (None, int(parent)) and port in ("", *words)]
+def supervisors_of(program: int) -> list[int]:
+    """The supervisors of a program, whether it has ended or not: the number of its process is in their command."""
+    found = subprocess.run(["ps", "-ww", "-eo", "pid=,args="], capture_output=True, text=True, check=True)
+    lines = [line.split() for line in found.stdout.splitlines() if "-m hw.safety.supervisor " in line]
+    return [int(own) for own, *words in lines if words[-1] == str(program)]
+
+
+def end_supervisors() -> None:
+    """End those of this process, also one that still insists."""
+    for supervisor in LIFELINE._supervisors:
+        supervisor.terminate()
+        with suppress(subprocess.TimeoutExpired):
+            supervisor.wait(0.3)
+        supervisor.kill()
+        supervisor.wait()

@@ -1,4 +1,4 @@
-"""The guard: the laser is off after every way in which a program can end, and before anything is said.
+"""The supervisor: everything is dark after every way in which a program can end, and before anything is said.
 
 The laser here is a few lines behind a pty; `python -m benchmarks laser-safety` uses the emulated firmware.
 """
@@ -13,13 +13,12 @@ from collections.abc import Callable
 
 import pytest
 import serial
-from guard_fakes import LIMIT_S, Laser, Opening, Run, guards_of, said_by, wait
+from capture_fakes import fork
+from supervisor_fakes import LIMIT_S, Laser, Opening, Run, said_by, supervisors_of, wait
 
 from hw.base.errors import SwitchedOff
-from hw.safety import guard
-from hw.safety.guard import GuardClosed
-from hw.safety.ports import protocol_guard
-from hw.safety.ports.protocol_guard import GuardedPort
+from hw.safety.ports.protocol_supervised import LIFELINE, GoneDark, Lifeline, SupervisedPort, require_supervisor
+from hw.safety.signals import ENDING
 from hw.serial.link import Link
 
 
@@ -29,11 +28,8 @@ def test_opening_switches_off_before_anything_is_said_and_closing_does_again(
 ) -> None:
     laser = lasers(on=True)
     port = ports(laser)
-    assert not laser.on  # by the time that the port is open
-    assert laser.said[0] == "LOf"
-    time.sleep(0.1)
-    assert port.in_waiting == 0  # the guard keeps the answers to its own commands
     port.write(b"?LOn\r")
+    assert said_by(port) == b"!LOf>" and laser.said[0] == "LOf"
     wait(laser, on=True)
     assert said_by(port) == b"!LOn>"
     begun = time.monotonic()
@@ -92,8 +88,7 @@ def test_it_insists_until_the_laser_confirms(lasers: Callable[..., Laser], ports
 @pytest.mark.parametrize("what", ["preheats", "refusals"])
 def test_a_laser_that_preheats_or_refuses_is_not_taken_for_off(laser: Laser, ports: Opening, what: str) -> None:
     port = ports(laser)
-    port.write(b"?GAS\r")
-    port.read(64)
+    said_by(port)  # to the LOf of opening it
     setattr(laser, what, 4)
     laser.said.clear()
     port.close()
@@ -104,14 +99,15 @@ STOPPED = """
 import sys
 from hw.base.clock import WallClock
 from hw.base.errors import DiscoError
+from hw.safety.ports.protocol_supervised import require_supervisor
 from hw.serial.link import Link
-link = Link("guard://" + sys.argv[1], 500000, "laser 635 nm", WallClock())
+link = Link("supervised://laser:" + sys.argv[1], 500000, "laser 635 nm", WallClock())
 link.write(b"?LOn\\r")
-link.require_guard()
+require_supervisor()
 print("on", flush=True)
 sys.stdin.readline()
 try:
-    link.require_guard()
+    require_supervisor()
 except DiscoError as error:
     print(error, flush=True)
 """
@@ -132,60 +128,62 @@ def test_off_while_the_program_is_stopped_which_says_so_when_it_continues(
         program.send_signal(signal.SIGCONT)
     assert laser.went_off - begun < LIMIT_S
     said, complaint = program.communicate("\n")
-    assert "laser 635 nm is closed: the program was stopped (Ctrl-Z" in said and "Remedy" in said, complaint
+    assert "the rig is dark: the program was stopped (Ctrl-Z" in said and "Remedy" in said, complaint
 
 
+@pytest.mark.timing
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_guard_that_is_killed_or_stopped_is_noticed_and_the_laser_goes_off(
+def test_a_supervisor_that_is_killed_or_stopped_is_replaced_by_one_that_makes_everything_dark(
+    laser: Laser, link: Link, number: signal.Signals
+) -> None:
+    """Nobody asks for anything meanwhile: the program is in a long exposure."""
+    link.write(b"?LOn\r")
+    wait(laser, on=True)
+    require_supervisor()
+    begun = time.monotonic()
+    os.kill(LIFELINE._supervisors[-1].pid, number)
+    wait(laser, on=False)
+    assert laser.went_off - begun < LIMIT_S
+    with pytest.raises(SwitchedOff, match=r"the rig is dark: its supervisor was killed or stopped .*Remedy"):
+        require_supervisor()
+    with pytest.raises(SwitchedOff, match="supervisor was killed or stopped"):
+        link.write(b"?GAS\r")
+    link.close()
+    assert laser.said[-1] == "GAS"
+    require_supervisor()  # nothing is lent any more
+
+
+@pytest.mark.parametrize("number", sorted(ENDING), ids=lambda n: n.name)
+def test_a_supervisor_that_is_told_to_end_makes_everything_dark_first(
     laser: Laser, link: Link, number: signal.Signals
 ) -> None:
     link.write(b"?LOn\r")
     wait(laser, on=True)
-    link.require_guard()
-    (victim,) = guards_of(os.getpid())
-    os.kill(victim, number)
-    end = time.monotonic() + 5.0
-    while not guard.stopped(victim) and number == signal.SIGSTOP:
-        assert time.monotonic() < end
-    if number == signal.SIGKILL:
-        os.waitid(os.P_PID, victim, os.WEXITED | os.WNOWAIT)
-    with pytest.raises(SwitchedOff, match=r"laser 635 nm is closed: its guard process was (killed|stopped)"):
-        link.require_guard()
-    wait(laser, on=False)  # by the guard that continues, or by another, before anything else is asked for
-    with pytest.raises(SwitchedOff, match="its guard process ended"):
-        link.require_guard()
-    link.close()
-    assert laser.said[-1] == "GAS"
-
-
-@pytest.mark.parametrize("number", sorted(guard.ENDING), ids=lambda n: n.name)
-def test_a_guard_that_is_told_to_end_switches_off_first(laser: Laser, link: Link, number: signal.Signals) -> None:
-    link.write(b"?LOn\r")
-    wait(laser, on=True)
-    os.kill(guards_of(os.getpid())[0], number)
+    os.kill(LIFELINE._supervisors[-1].pid, number)
     wait(laser, on=False)
-    with pytest.raises(SwitchedOff, match="its guard has closed it"):
-        link.require_guard()
+    with pytest.raises(SwitchedOff, match="the supervisor was told to end"):
+        require_supervisor()
 
 
 def test_a_port_that_does_not_exist_is_an_error_of_opening() -> None:
     with pytest.raises(serial.SerialException, match="No such file"):
-        GuardedPort("guard:///dev/disco-no-such-port", baudrate=500000, timeout=0.5)
+        SupervisedPort("supervised://laser:/dev/disco-no-such-port", baudrate=500000, timeout=0.5)
 
 
 def test_a_dead_port_says_so(laser: Laser, ports: Opening) -> None:
     port = ports(laser)
-    port.trip()
-    with pytest.raises(GuardClosed, match="its guard has closed it"):
+    LIFELINE._supervisors[-1].terminate()
+    LIFELINE._supervisors[-1].wait(5.0)
+    with pytest.raises(GoneDark, match="was told to end"):
         port.write(b"?GAS\r")
-    with pytest.raises(GuardClosed, match="its guard has closed it"):
+    with pytest.raises(GoneDark, match="was told to end"):
         port.read(1)
 
 
-def test_a_stop_or_kill_of_the_whole_foreground_group_does_not_reach_the_guard(laser: Laser, run: Run) -> None:
-    """Ctrl-Z and `kill -9 -GROUP` go to every process of the program's group: the guard is in none of them."""
+def test_a_stop_or_kill_of_the_whole_foreground_group_does_not_reach_it(laser: Laser, run: Run) -> None:
+    """Ctrl-Z and `kill -9 -GROUP` go to every process of the program's group: the supervisor is in none of them."""
     program = run(laser, "wait", STOPPED)
-    (own,) = guards_of(program.pid)
+    (own,) = supervisors_of(program.pid)
     os.killpg(program.pid, signal.SIGSTOP)
     try:
         wait(laser, on=False)
@@ -197,43 +195,45 @@ def test_a_stop_or_kill_of_the_whole_foreground_group_does_not_reach_the_guard(l
     wait(laser, on=False)
 
 
-def test_guard_and_program_killed_together_leave_it_on_until_the_next_connection(
+def test_supervisor_and_program_killed_together_leave_it_on_until_the_next_connection(
     laser: Laser, run: Run, ports: Opening
 ) -> None:
     """What docs/lab.md says that only hardware covers: so it is, and connecting again ends it."""
     program = run(laser, "wait")
-    (own,) = guards_of(program.pid)
+    (own,) = supervisors_of(program.pid)
     for victim, number in ((own, signal.SIGSTOP), (program.pid, signal.SIGKILL), (own, signal.SIGKILL)):
         os.kill(victim, number)
     program.wait()
     time.sleep(0.5)
     assert laser.on
     ports(laser)
-    assert not laser.on
+    wait(laser, on=False)
 
 
 @pytest.mark.timing
-def test_every_guard_sees_the_signal(lasers: Callable[..., Laser], run: Run) -> None:
-    """Three lasers, three guards, one signal, and a main thread that never gets to it."""
+def test_every_laser_goes_off_though_one_is_mute(lasers: Callable[..., Laser], run: Run) -> None:
+    """Three lasers, one signal, and a main thread that never gets to it; one laser neither obeys nor answers."""
     three = [lasers() for _ in range(3)]
     program = run(three[0], ",".join(laser.port for laser in three[1:]), THREE)
     for laser in three:
         wait(laser, on=True)
+    three[0].deaf = 10**9
     begun = time.monotonic()
     program.send_signal(signal.SIGTERM)
-    for laser in three:
-        wait(laser, on=False, limit_s=2 * LIMIT_S)
+    for laser in three[1:]:
+        wait(laser, on=False)
     assert program.poll() is None  # it has not got to its handler
-    assert all(begun < laser.went_off < begun + 2 * LIMIT_S for laser in three)
+    assert all(begun < laser.went_off < begun + LIMIT_S for laser in three[1:])
+    three[0].deaf = 0
+    wait(three[0], on=False)
 
 
 THREE = """
 import signal, sys
-from hw.safety.ports import protocol_guard
-from hw.safety.ports.protocol_guard import GuardedPort
+from hw.safety.ports.protocol_supervised import SupervisedPort
 signal.signal(signal.SIGTERM, lambda *_: sys.exit())
 names = [sys.argv[1], *sys.argv[2].split(",")]
-ports = [GuardedPort("guard://" + name, baudrate=500000, timeout=0.5, write_timeout=1) for name in names]
+ports = [SupervisedPort("supervised://laser:" + name, baudrate=500000, timeout=0.5, write_timeout=1) for name in names]
 for port in ports:
     port.write(b"?LOn\\r")
 print("on", flush=True)
@@ -241,28 +241,46 @@ sum(range(2 * 10**9))
 """
 
 
-def test_ctrl_c_while_a_guard_starts_leaves_none_counted(
+@pytest.mark.timing
+def test_a_program_that_hangs_goes_dark_though_nobody_tells_it_to_end(laser: Laser, run: Run) -> None:
+    """It gives no sign of life: a step of C that keeps the interpreter, a machine that has no memory left."""
+    program = run(laser, "deaf")
+    wait(laser, on=False, limit_s=3.0 + LIMIT_S)
+    program.kill()
+
+
+def test_signals_to_a_forked_child_are_none_of_the_programs(laser: Laser, ports: Opening) -> None:
+    """A pool of workers is ended by SIGTERM."""
+    port = ports(laser)
+    port.write(b"?LOn\r")
+    wait(laser, on=True)
+    child = fork(_until_terminated)
+    time.sleep(0.2)
+    child.terminate()
+    child.join()
+    time.sleep(0.2)
+    assert laser.on
+    require_supervisor()
+
+
+def _until_terminated() -> None:
+    signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
+    time.sleep(10.0)
+
+
+def test_ctrl_c_while_the_supervisor_starts_leaves_no_port_lent(
     laser: Laser, ports: Opening, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A notebook goes on: with one guard too many, the next laser would be switched off by the signal of before."""
-    before = protocol_guard._SIGNALS.guards
-
-    def interrupted(self: socket.socket, size: int) -> bytes:
-        raise KeyboardInterrupt
-
-    started = []
-    start = GuardedPort._start
+    """A notebook goes on: the port is not lent, and can be opened again."""
 
     class Interrupted(socket.socket):
-        recv = interrupted  # type: ignore[assignment]
+        def recv(self, size: int) -> bytes:  # type: ignore[override]
+            raise KeyboardInterrupt
 
-    def spied(self: GuardedPort) -> socket.socket:
-        ours = start(self)
-        started.append(self._guard)
-        return Interrupted(fileno=ours.detach())
-
-    monkeypatch.setattr(GuardedPort, "_start", spied)
-    with pytest.raises(KeyboardInterrupt):
-        ports(laser)
-    assert protocol_guard._SIGNALS.guards == before
-    assert started[0] is not None and started[0].poll() is not None  # ended, and waited for
+    lend = Lifeline.lend
+    with monkeypatch.context() as pressing:
+        pressing.setattr(Lifeline, "lend", lambda own, request: Interrupted(fileno=lend(own, request).detach()))
+        with pytest.raises(KeyboardInterrupt):
+            ports(laser)
+    assert not LIFELINE.lent
+    assert ports(laser).is_open
