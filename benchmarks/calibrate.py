@@ -26,8 +26,8 @@ from disco_twin.camera.sensor import gamma_curve
 from disco_twin.camera.targets import TargetSource
 from disco_twin.faults.actual_rig import actual_rig
 from disco_twin.object.shapes import pebble
-from disco_twin.scene.object_schema import Pebble
 from disco_twin.scene.rig_schema import FaultsConfig, TwinRigConfig
+from disco_twin.scene.shape_schema import Pebble
 from hw.record import to_radiance
 from pipeline.calibrate import pose as pose_module
 from pipeline.calibrate.intrinsics import find_corners, fit_intrinsics

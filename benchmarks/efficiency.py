@@ -18,7 +18,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -273,7 +273,7 @@ def images(name: str, obj: Any, quick: bool) -> tuple[F64, list[Job]]:
     from disco_twin.light.transport import CameraLobe, Transport
     from pipeline.geometry.camera import PinholeCamera, look_at
 
-    obj = replace(obj, medium=obj.medium.of_lasers([0]))
+    obj = obj.of_lasers([0])
     size = float(np.abs(obj.mesh.vertices).max()) / 18.0  # of quick's stone
     pose = look_at((390.0, -120.0, 190.0), (0.0, 0.0, 0.0))
     camera = PinholeCamera(48, 32, np.full(2, 62.0 / 0.176 / size), np.array([24.0, 16.0]), np.zeros(5), pose)

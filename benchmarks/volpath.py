@@ -41,8 +41,10 @@ def volpath_scene(
     met where paths leave. A rough boundary blocks every one of them, and they take half of the time; it is for lights
     that are not a point, a line or a direction.
 
-    Raises: InputError for a camera that distorts and for lasers that cannot share paths.
+    Raises: InputError for a camera that distorts, for bodies inside and for lasers that cannot share paths.
     """
+    if obj.inside:
+        raise InputError("outside renders know no bodies inside the object", allowed="objects without `inside`")
     if camera.distortion.any():
         raise InputError("Mitsuba's own camera has no distortion", value=camera.distortion.tolist(), allowed="zeros")
     path = folder / "object.ply"

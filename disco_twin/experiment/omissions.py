@@ -13,7 +13,7 @@ def left_out_by_the_twin(experiment: Experiment) -> list[dict[str, str]]:
     out = []
     if medium.g_voxels is None and all(np.ptp(m) == 0 for a in (medium.sigma_t, medium.albedo) for m in a):
         out.append(("medium grid", "the medium is homogeneous"))
-    if len(medium.sigma_t) > 1 and len(medium.groups()) == 1:
+    if len(medium.sigma_t) > 1 and len(experiment.object.groups()) == 1:
         out.append(("a walk per wavelength", "sigma_t and g are the same at all wavelengths: one walk serves them"))
     if experiment.object.boundary.kind == "matched":
         out.append(("boundary sampling", "the object is index-matched"))

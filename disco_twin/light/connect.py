@@ -32,6 +32,7 @@ from disco_twin.light.tables import (
     cell_index,
     medium_at,
 )
+from disco_twin.light.walls import is_outer
 
 CONNECTIONS = 2.0  # even ones that an isotropic collision right below a surface sends along its normal, in the mean
 LEAST, MOST = 0.05, 4.0  # times that a collision sends, whatever it promises
@@ -71,6 +72,8 @@ def lobe_at(t: Tables, q: Any, target: Any) -> tuple[Any, Any, Any]:
     hit = t.scene.ray_intersect(mi.Ray3f(q, guess, t.length, 0.0, mi.Color0f()), mi.RayFlags.Minimal, False, True)
     outside = dr.dot(hit.n, towards)
     usable = hit.is_valid() & (outside > 0.0)
+    if t.walls is not None:
+        usable &= is_outer(t.walls, hit)
     kappa = mi.Float(t.kappa)
     if t.eta > 1.0:
         # A facet that is tilted by v turns what it refracts by v (1 - cos_o / (eta cos_i)) in the plane of incidence,
@@ -228,7 +231,10 @@ def connect_lobes(
                 hit = t.scene.ray_intersect(
                     mi.Ray3f(point, omega, t.length, 0.0, mi.Color0f()), mi.RayFlags.Minimal, False, True
                 )
-                if dr.hint(hit.is_valid()):
+                met = hit.is_valid()
+                if dr.hint(t.walls is not None, mode="scalar"):
+                    met &= is_outer(t.walls, hit)  # walls inside are not connected through (walls.py)
+                if dr.hint(met):
                     hit.sh_frame = mi.Frame3f(hit.n)
                     hit.wi = hit.to_local(-omega)
                     position, towards, pixel, factor, seen = project(cams, camera, hit.p)

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
+from disco_twin.object.bodies import OwnMedium
 from disco_twin.object.build import TwinObject
 from hw.base.arrays import F64, I64, Bool
 
@@ -110,7 +111,21 @@ def mean_coefficients(obj: TwinObject, laser: int, centres: F64, cell: float) ->
         for k, values in enumerate(read):
             sums[k] += ndimage.map_coordinates(values, grid[:, ::-1].T, order=1, mode="nearest")
     absorption, scattering, *reduced = sums / INNER_POINTS**3
-    return absorption, scattering, reduced[0] if reduced else scattering * (1 - medium.g[laser])
+    found = absorption, scattering, reduced[0] if reduced else scattering * (1 - medium.g[laser])
+    return _in_bodies(obj, laser, centres, found) if obj.inside else found
+
+
+def _in_bodies(obj: TwinObject, laser: int, centres: F64, coefficients: tuple[F64, F64, F64]) -> tuple[F64, F64, F64]:
+    """The coefficients where bodies inside hold the cells' middles, too. Walls bend no light here."""
+    found, grid = np.stack(coefficients), np.stack(coefficients)
+    for body in obj.inside:
+        held = np.asarray(body.mesh.contains(centres))
+        if isinstance(body.medium, OwnMedium):
+            sigma_t, albedo, g = (values[laser] for values in (body.medium.sigma_t, body.medium.albedo, body.medium.g))
+            found[:, held] = np.array([1 - albedo, albedo, albedo * (1 - g)])[:, None] * sigma_t
+        else:
+            found[:, held] = grid[:, held] if body.medium else 0.0
+    return found[0], found[1], found[2]
 
 
 def diffusion(obj: TwinObject, laser: int, cells: int = CELLS) -> Diffusion:

@@ -15,7 +15,7 @@ without noise of their own between them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -69,7 +69,7 @@ class Moments:
 
 def copies_of_one_laser(obj: TwinObject, laser: int) -> TwinObject:
     """The object with three wavelengths that are all this one."""
-    return replace(obj, medium=obj.medium.of_lasers([laser] * 3))
+    return obj.of_lasers([laser] * 3)
 
 
 def moments(transport: Transport, basis: sparse.csr_matrix, columns: I64, laser: int, walks: int, seed: int) -> Moments:

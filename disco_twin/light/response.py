@@ -44,11 +44,13 @@ def light_key(obj: TwinObject, config: RigConfig, actual: ActualRig) -> str:
     projector = actual.projector
     parts: list[ArrayLike] = [obj.mesh.vertices, obj.mesh.faces, medium.sigma_t, medium.albedo, medium.g]
     parts += [] if medium.g_voxels is None else [medium.g_voxels]
+    parts += [part for body in obj.inside for part in (body.mesh.vertices, body.mesh.faces)]
     parts += [medium.low, medium.high, *actual.turns, projector.pose, projector.full_angle_rad]
     parts += [projector.steps, projector.separation_mm, actual.mirror_steps, actual.seed]
     for camera in actual.cameras:
         parts += [(camera.width, camera.height), camera.focal, camera.centre, camera.distortion, camera.pose]
-    digest = hashlib.sha256(repr((boundary, config.projector.beam_diameter_mm, config.projector.beam_profile)).encode())
+    fixed = boundary, config.projector.beam_diameter_mm, config.projector.beam_profile
+    digest = hashlib.sha256(repr((*fixed, *((b.around, b.wall, b.medium) for b in obj.inside))).encode())
     for part in map(np.ascontiguousarray, parts):
         digest.update(repr((part.dtype.str, part.shape)).encode())
         digest.update(part.tobytes())

@@ -14,8 +14,9 @@ from typing import Any, Literal
 import drjit as dr
 import mitsuba as mi
 
+from disco_twin.light.opaque import Opaque
 from disco_twin.light.sampling import Rng
-from disco_twin.light.tables import Opaque, Tables, surroundings
+from disco_twin.light.tables import Tables, surroundings
 
 CAPACITY = 24  # states that wait; a photon that finds the stack full is not split
 MOST_COPIES = 8  # of one split
@@ -79,9 +80,10 @@ class Stack:
 
 
 def state_size(t: Tables, connects: bool) -> int:
-    """Floats of a state: place, direction, power; and for connections to cameras the last
-    collision, phase density and lobes."""
-    return 6 + t.lasers + (5 if connects else 0)
+    """Floats of a state: place, direction, power; the region, where there are several; and for connections to cameras
+    the last collision, phase density and lobes.
+    """
+    return 6 + t.lasers + (t.walls is not None) + (5 if connects else 0)
 
 
 def new_stack(t: Tables, connects: bool, lanes: int) -> Stack:
@@ -99,7 +101,9 @@ def resume(t: Tables, stack: Stack, photon: Any, running: Any, weight: Any, conn
         photon.p, photon.d, photon.w = mi.Point3f(*v[0:3]), mi.Vector3f(*v[3:6]), weight(*v[6 : 6 + t.lasers])
         if dr.hint(connects, mode="scalar"):
             photon.last, photon.phase, photon.lobes = mi.Point3f(*v[-5:-2]), v[-2], v[-1]
-        photon.empty, photon.rate = surroundings(t, photon.p)
+        if dr.hint(t.walls is not None, mode="scalar"):
+            photon.region = mi.UInt32(v[6 + t.lasers])
+        photon.empty, photon.rate = surroundings(t, photon.p, photon.region)
         photon.alive, photon.inside, photon.entered = mi.Bool(True), mi.Bool(True), mi.Bool(True)
         photon.clear, photon.steps = mi.Vector3f(0.0), mi.UInt32(0)
         left = stack.copies.read(top) - 1
@@ -134,7 +138,8 @@ def weigh(
                 count = mi.UInt32(dr.minimum(ratio, MOST_COPIES))
                 photon.w /= mi.Float(count)
                 power = [photon.w[k] for k in range(t.lasers)]
-                values = [*photon.p, *photon.d, *power, *photon.last, photon.phase, photon.lobes]
+                region = [] if t.walls is None else [mi.Float(photon.region)]
+                values = [*photon.p, *photon.d, *power, *region, *photon.last, photon.phase, photon.lobes]
                 size = state_size(t, connects)
                 for k in range(size):
                     stack.numbers.write(values[k], stack.depth * size + k)

@@ -36,7 +36,7 @@ class SpotWalks:
 
 def walk_seconds(obj: TwinObject, collisions: float) -> float:
     """Seconds of a core for a plain walk of all wavelengths, each scattered so often (`Diffusion.collisions`)."""
-    return len(obj.medium.groups()) * (START_S + COLLISION_S * collisions)
+    return len(obj.groups()) * (START_S + COLLISION_S * collisions)
 
 
 def photon_density(estimate: Diffusion, fluence: F64, walks: SpotWalks) -> F64:

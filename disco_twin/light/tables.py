@@ -7,25 +7,19 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from disco_twin.light.opaque import Opaque
 from disco_twin.light.sampling import Rng, exponential
+from disco_twin.light.walls import rate_in
 
 FAR = 1e30
-
-
-class Opaque:
-    """Arrays that the walk reads or adds to. Not a dataclass: Dr.Jit would carry its fields through every loop."""
-
-    def __init__(self, **fields: Any) -> None:
-        if set(fields) != set(type(self).__annotations__):
-            raise TypeError(f"{type(self).__name__} takes {sorted(type(self).__annotations__)}")
-        self.__dict__.update(fields)
 
 
 class Tables(Opaque):
     """What the walk reads; see transport.py for where it comes from. Floats are opaque so that kernels are reused."""
 
     scene: Any
-    bsdf: Any
+    bsdf: Any  # of the outer surface
+    walls: Any  # `Walls` of bodies inside, or None
     lasers: int
     matched: bool
     shine: bool  # the surface reflects light and lets none in
@@ -115,8 +109,11 @@ def cell_index(t: Tables, q: Any) -> Any:
     return mi.UInt32((cell.z * t.cells + cell.y) * t.cells + cell.x)
 
 
-def surroundings(t: Tables, q: Any) -> tuple[Any, Any]:
-    """Radius of a ball about q that holds no surface (none if <= 0), and the majorant for a flight from q."""
+def surroundings(t: Tables, q: Any, region: Any = None) -> tuple[Any, Any]:
+    """Radius of a ball about q that holds no surface (none if <= 0), and the majorant for a flight from q.
+
+    region: that q lies in, where the object has bodies inside.
+    """
     grid = (q - t.low) * t.inverse_cell
     cell = dr.floor(grid)
     off_centre = dr.norm(grid - cell - 0.5) / t.inverse_cell
@@ -124,8 +121,10 @@ def surroundings(t: Tables, q: Any) -> tuple[Any, Any]:
     index = mi.UInt32((whole.z * t.cells + whole.y) * t.cells + whole.x)
     if t.local:
         found = dr.gather(mi.Vector2f, t.distance, index)
-        return found[0] - off_centre, found[1]
-    return dr.gather(mi.Float, t.distance, index) - off_centre, mi.Float(t.majorant)
+        empty, rate = found[0] - off_centre, found[1]
+    else:
+        empty, rate = dr.gather(mi.Float, t.distance, index) - off_centre, mi.Float(t.majorant)
+    return empty, rate if region is None else rate_in(t.walls, region, rate)
 
 
 def near_surface(t: Tables, empty: Any) -> Any:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from disco_twin.light import tables as kernel
@@ -21,6 +22,8 @@ from disco_twin.light.sources import EnvironmentSource, Source, opaque3, to_floa
 from disco_twin.light.splitting import Window
 from disco_twin.light.tables import FAR
 from disco_twin.light.walk import Tally, walk
+from disco_twin.light.walls import bsdf_of, walls_of
+from disco_twin.object.bodies import OwnMedium
 from disco_twin.object.build import Medium, TwinObject
 from hw.base.arrays import F32, F64, I64
 from pipeline.geometry.camera import PinholeCamera
@@ -74,7 +77,7 @@ class Transport:
         self.faces = np.asarray(obj.mesh.faces, np.int64)
         self.radius = float(np.linalg.norm(self.vertices, axis=1).max()) * 1.001
         self.lasers = len(obj.medium.sigma_t)
-        self.groups = obj.medium.groups()
+        self.groups = obj.groups()
         bsdfs: dict[str, dict[str, Any]] = {
             "rough": {
                 "type": "roughdielectric", "int_ior": obj.boundary.eta, "ext_ior": 1.0,
@@ -83,7 +86,12 @@ class Transport:
             "smooth": {"type": "dielectric", "int_ior": obj.boundary.eta, "ext_ior": 1.0},
             "matched": {"type": "null"},
         }  # fmt: skip
-        self.scene = mesh_scene(self.vertices, self.faces, bsdfs[obj.boundary.kind])
+        surfaces = [(self.vertices, self.faces, bsdfs[obj.boundary.kind])]
+        surfaces += [(body.mesh.vertices, body.mesh.faces, bsdf_of(body.wall)) for body in obj.inside]
+        self._shapes = [shape_of(f"surface-{k}", *surface) for k, surface in enumerate(surfaces)]
+        # Not optimised: meshes would be merged, and a hit could no longer tell them apart.
+        named = {f"surface-{k}": shape for k, shape in enumerate(self._shapes)}
+        self.scene = mi.load_dict({"type": "scene", **named}, optimize=False)
         self._cells, self._local = cells, local
         self._diffusion: dict[int, Diffusion] = {}
         self._last_targets: tuple[tuple[int, bytes, float], F64] | None = None
@@ -91,7 +99,7 @@ class Transport:
 
     @cached_property
     def _field(self) -> DistanceField:
-        return build_distance_field(self.object.mesh, self._cells)
+        return object_field(self.object, self._cells)
 
     @cached_property
     def _distance(self) -> mi.Float:
@@ -112,7 +120,7 @@ class Transport:
         field = self._field
         return dict(
             scene=self.scene,
-            bsdf=self.scene.shapes()[0].bsdf(),
+            bsdf=self._shapes[0].bsdf(),
             matched=self.object.boundary.kind == "matched",
             shine=False,
             even=False,
@@ -161,12 +169,14 @@ class Transport:
         local = self._local_majorants(sigma_t) if self._local and not homogeneous else None
         bounds = np.stack([self._field.distance, local.rate], axis=-1) if local is not None else None
         nz, ny, nx = sigma_t.shape
+        own = [body.medium for body in self.object.inside if isinstance(body.medium, OwnMedium)]
         g, g_voxels = float(medium.g[group[0]]), medium.g_voxels
         return kernel.Tables(
             **self._shared,
+            walls=walls_of(self.object.inside, self._shapes, group) if self.object.inside else None,
             lasers=len(group),
             homogeneous=homogeneous and sigma_t.max() > 0,
-            isotropic=g == 0.0 and g_voxels is None,
+            isotropic=g == 0.0 and g_voxels is None and not any(any(m.g) for m in own),
             g=dr.opaque(mi.Float, g),
             g_voxels=None if g_voxels is None else to_float(g_voxels[group[0]]),
             majorant=dr.opaque(mi.Float, majorant),
@@ -238,6 +248,8 @@ class Transport:
         images of the first half of the walks, too. even: connections are (connect.py). shine: the surface reflects
         light and lets none in.
         """
+        if cameras and self.object.inside and self.object.boundary.kind == "matched":
+            raise ValueError("nothing connects to a camera through walls inside an object without a boundary")
         streams = np.arange(tags, dtype=np.uint32) if streams is None else streams.astype(np.uint32)
         parts = [
             self._trace_group(
@@ -315,16 +327,29 @@ def stretches(walks: int, step: int) -> Iterator[tuple[int, int]]:
             yield start, min(step, high - start)
 
 
-def mesh_scene(vertices: F64, faces: I64, bsdf: dict[str, Any]) -> mi.Scene:
-    """A Mitsuba scene of one mesh with flat (geometric) normals: exact reciprocity, no weight lost to shading."""
+def object_field(obj: TwinObject, cells: int) -> DistanceField:
+    """Distances to all surfaces; normals of the outer one, through which lobes connect."""
+    whole = build_distance_field(obj.mesh, cells)
+    if not obj.inside:
+        return whole
+    walls = [body.mesh.copy() for body in obj.inside]
+    for wall, body in zip(walls, obj.inside, strict=True):
+        if body.medium is None:  # distances are best on the side that a surface faces away from: where light scatters
+            wall.invert()
+    every = build_distance_field(trimesh.util.concatenate([obj.mesh, *walls]), cells)
+    return replace(every, normal=whole.normal)
+
+
+def shape_of(name: str, vertices: F64, faces: I64, bsdf: dict[str, Any]) -> mi.Mesh:
+    """A Mitsuba mesh with flat (geometric) normals: exact reciprocity, no weight lost to shading."""
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf)
-    mesh = mi.Mesh("object", len(vertices), len(faces), has_vertex_normals=False, props=properties)
+    mesh = mi.Mesh(name, len(vertices), len(faces), has_vertex_normals=False, props=properties)
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = to_float(vertices)
     parameters["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
     parameters.update()
-    return mi.load_dict({"type": "scene", "object": mesh})
+    return mesh
 
 
 def camera_table(cameras: Sequence[PinholeCamera]) -> kernel.Cameras:

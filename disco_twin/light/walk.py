@@ -12,6 +12,7 @@ written for Dr.Jit's symbolic loops:
   weight for each;
 - *lobe connection*: of the collisions of an outer step that lie near the surface one is drawn (reservoir) and connects
   to the cameras; exits do so too (connect.py);
+- *bodies inside*: cavities and inclusions with walls of their own, among which a photon knows its region (walls.py);
 - *both ways*: a walk may start at a camera's pixel and meet a sky where it leaves. Paths are reciprocal: the share of
   the sky's radiance that it carries out is what comes back to the pixel, for power and importance cross the boundary by
   the same factors, whose eta^2 cancel from air to air (Veach 1997, section 5.2).
@@ -19,7 +20,7 @@ written for Dr.Jit's symbolic loops:
 Images and deposits are accumulated as 64-bit integers of stochastically rounded weights: exact, independent of the
 order of atomics, and so of batch size and thread count.
 
-Not supported: emission, polarisation, an index that varies inside, wavelength change.
+Not supported: emission, polarisation, an index that varies within a body, wavelength change.
 """
 
 from __future__ import annotations
@@ -48,6 +49,8 @@ from disco_twin.light.tables import (
     near_surface,
     surroundings,
 )
+from disco_twin.light.walls import is_outer, medium_in, region_of, scatters
+from disco_twin.object.bodies import OBJECT
 
 INNER = 8  # collisions per outer step
 MAX_STEPS = 1 << 18  # intersection tests after which a photon, or a copy of one, is cut off: its power is `inside`
@@ -90,7 +93,7 @@ class Photon:
     w: Any  # power per wavelength
     tag: Any
     steps: Any  # intersection tests so far
-    inside: Any  # in the medium now
+    inside: Any  # in a medium now
     entered: Any  # has ever been
     alive: Any
     empty: Any  # radius of a ball about p that holds no surface
@@ -100,6 +103,7 @@ class Photon:
     last: Any
     lobes: Any  # in the mean, to one camera
     phase: Any  # 0 before the first collision
+    region: Any  # number of the region that it flies in; None where no bodies are inside
 
 
 @dataclass
@@ -126,7 +130,7 @@ def no_photons(t: Tables, weight: Any, lanes: int) -> tuple[Photon, Reservoir]:
     photon = Photon(
         mi.Point3f(point), down, weight(power), mi.UInt32(integer), mi.UInt32(integer), mi.Bool(flag), mi.Bool(flag),
         mi.Bool(flag), mi.Float(number), mi.Float(number + 1.0), mi.Vector3f(vector), mi.Point3f(point),
-        mi.Float(number), mi.Float(number),
+        mi.Float(number), mi.Float(number), None if t.walls is None else mi.UInt32(integer),
     )  # fmt: skip
     g = None if t.g_voxels is None else mi.Float(number)
     drawn = Reservoir(mi.Float(number), mi.Point3f(point), mi.Vector3f(vector), weight(power), mi.Float(number), g)
@@ -144,10 +148,15 @@ def collide(
     Returns (photon, reservoir, sums, rng): Dr.Jit's branches replace the objects that they change.
     """
     chance, albedo, g = medium_at(t, photon.p, rng)
-    if dr.hint(rng.next() * rate < chance * t.majorant):
+    sigma_t = chance * t.majorant
+    if dr.hint(t.walls is not None, mode="scalar"):
+        sigma_t, albedo, g = medium_in(t.walls, photon.region, sigma_t, albedo, g)
+    if dr.hint(rng.next() * rate < sigma_t):
         sums.absorbed += type(sums.absorbed)(photon.w * (1.0 - albedo))
         photon.w *= albedo
         near = near_surface(t, photon.empty)
+        if dr.hint(t.walls is not None, mode="scalar"):
+            near &= photon.region == OBJECT
         lobes = dr.select(near, 1.0, mi.Float(0.0))
         if dr.hint(cams is not None, mode="scalar"):
             if dr.hint(t.even, mode="scalar"):
@@ -184,7 +193,7 @@ def cross(
 
     Returns (photon, sums, rng).
     """
-    if dr.hint(t.matched, mode="scalar"):
+    if dr.hint(t.matched and t.walls is None, mode="scalar"):
         leaves = dr.dot(si.n, photon.d) > 0.0
         if dr.hint(deposits is not None, mode="scalar"):
             deposit(t, deposits, photon.tag, si, photon.w, rng, leaves)
@@ -192,28 +201,37 @@ def cross(
     else:
         si.sh_frame = mi.Frame3f(si.n)
         si.wi = si.to_local(-photon.d)
+        outer = is_outer(t.walls, si)
+        bsdf = t.bsdf if t.walls is None else si.shape.bsdf()
         if dr.hint(cams is not None, mode="scalar"):
             lobed = photon.inside & (photon.lobes > 0.0) & (dr.norm(si.p - photon.last) < t.length)
             weight = photon.w * counted(window, first_tag + photon.tag, dr.select(lobed, photon.last, si.p))
+            if dr.hint(t.walls is not None, mode="scalar"):
+                weight = dr.select(outer, weight, 0.0)
             rng = connect_exit(
                 t, cams, images, photon.tag, si, photon.d, weight, photon.last, photon.phase,
                 dr.select(lobed, photon.lobes, 0.0), ~photon.entered, rng,
             )  # fmt: skip
-        sample, value = t.bsdf.sample(boundary_context(t), si, rng.next(), rng.next2(), True)
+        sample, value = bsdf.sample(boundary_context(t), si, rng.next(), rng.next2(), True)
         after = photon.w * value[0]
         sums.boundary += type(sums.boundary)(photon.w - after)
         photon.w = after
         photon.alive = dr.max(after) > 0.0
         goes_in = sample.wo.z < 0.0
         if dr.hint(deposits is not None, mode="scalar"):
-            deposit(t, deposits, photon.tag, si, after, rng, photon.inside & ~goes_in & photon.alive)
+            deposit(t, deposits, photon.tag, si, after, rng, outer & photon.inside & ~goes_in & photon.alive)
         photon.d = mi.Vector3f(si.to_world(sample.wo))
-        photon.inside = goes_in
-    photon.entered |= photon.inside
+        photon.inside = mi.Bool(goes_in)
+    goes_in = mi.Bool(photon.inside)
+    photon.entered |= goes_in
+    if dr.hint(t.walls is not None, mode="scalar"):
+        within = region_of(t.walls, si)
+        photon.region = dr.select(goes_in, within, dr.gather(mi.UInt32, t.walls.around, within))
+        photon.inside = scatters(t.walls, photon.region)
     photon.lobes = mi.Float(0.0)
     photon.p = mi.Point3f(si.p)
-    photon.clear = mi.Vector3f(si.n * dr.select(photon.inside, -t.lift, t.lift))
-    _, photon.rate = surroundings(t, photon.p)
+    photon.clear = mi.Vector3f(si.n * dr.select(goes_in, -t.lift, t.lift))
+    _, photon.rate = surroundings(t, photon.p, photon.region)
     photon.empty = mi.Float(0.0)
     return photon, sums, rng
 
@@ -240,7 +258,7 @@ def fly(
     else:
         if dr.hint(photon.inside):
             photon.p = mi.Point3f(dr.fma(photon.d, flight, photon.p))
-            photon.empty, photon.rate = surroundings(t, photon.p)
+            photon.empty, photon.rate = surroundings(t, photon.p, photon.region)
             leaked = dr.max(dr.abs(photon.p)) > t.bound  # only through a mesh that is not watertight
             sums.inside += wide(dr.select(leaked, photon.w, 0.0))
             photon.alive = ~leaked
@@ -251,10 +269,15 @@ def fly(
                 # Not of a walk that has met nothing: what lies behind the object is no part of its image.
                 met = photon.phase > 0.0 if t.matched else photon.steps > 1
                 meet_sky(t, sky, images, photon.tag, photon.d, photon.w, ~photon.entered, rng, met)
-            sums.reflected += wide(dr.select(photon.entered, 0.0, photon.w))
-            sums.escaped += wide(dr.select(photon.entered, photon.w, 0.0))
+            left = mi.Bool(True)
+            if dr.hint(t.walls is not None, mode="scalar"):
+                left = photon.region == 0  # else out of a clear body whose mesh is not watertight
+                sums.inside += wide(dr.select(left, 0.0, photon.w))
+            sums.reflected += wide(dr.select(left & ~photon.entered, photon.w, 0.0))
+            sums.escaped += wide(dr.select(left & photon.entered, photon.w, 0.0))
             photon.alive = mi.Bool(False)
-    cut = photon.alive & photon.inside & (photon.steps > MAX_STEPS)  # outside it has been counted by the deposits
+    within = photon.inside if t.walls is None else photon.region != 0
+    cut = photon.alive & within & (photon.steps > MAX_STEPS)  # outside it has been counted by the deposits
     sums.inside += wide(dr.select(cut, photon.w, 0.0))
     photon.alive &= ~cut
     return photon, reservoir, sums, rng
@@ -299,6 +322,8 @@ def walk(
             photon.tag, photon.steps, photon.clear = tag, mi.UInt32(0), mi.Vector3f(0.0)
             photon.inside, photon.entered = mi.Bool(False), mi.Bool(False)
             photon.lobes, photon.phase = mi.Float(0.0), mi.Float(0.0)
+            if dr.hint(t.walls is not None, mode="scalar"):
+                photon.region = mi.UInt32(0)
 
         # 2. Collisions that need no intersection test.
         k = mi.UInt32(0)
@@ -307,7 +332,7 @@ def walk(
             k += 1
             flight, rate = free_flight(t, photon.d, photon.rate, rng)
             q = mi.Point3f(dr.fma(photon.d, flight, photon.p))
-            ball, there = surroundings(t, q)
+            ball, there = surroundings(t, q, photon.region)
             pending = flight >= photon.empty + ball
             if dr.hint(~pending):
                 # Copies: two names of one object would be merged as one when Dr.Jit joins the branches.

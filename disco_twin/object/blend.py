@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from disco_twin.scene.object_schema import Blend, Capsule, Ellipsoid
+from disco_twin.scene.shape_schema import Blend, Capsule, Ellipsoid
 from hw.base.arrays import F64
 from hw.base.errors import InputError
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -9,12 +10,14 @@ import trimesh
 
 from disco_twin.object import shapes
 from disco_twin.object.blend import blend
+from disco_twin.object.bodies import OBJECT, Body, Named, OwnMedium, bodies_of, check_nesting, shells_of
 from disco_twin.object.extrusion import extrusion
 from disco_twin.object.media import Medium, build_medium
 from disco_twin.object.mesh import hat_basis, read_mesh
 from disco_twin.object.remesh import remesh
 from disco_twin.object.scanner import scan_points
-from disco_twin.scene.object_schema import MOST_VERTICES, Blend, Box, Extrusion, MeshFile, Pebble, Shape, Sphere, Torus
+from disco_twin.scene.object_schema import MOST_VERTICES
+from disco_twin.scene.shape_schema import Blend, Box, Extrusion, MeshFile, Pebble, Shape, Sphere, Torus
 from hw.base.errors import InputError
 from pipeline.geometry.mesh_file import require_size
 from pipeline.geometry.surface_from_points import reconstruct_surface
@@ -39,11 +42,30 @@ class TwinBoundary:
 
 @dataclass(frozen=True)
 class TwinObject:
-    """A closed mesh (object frame, mm), its boundary and the medium inside."""
+    """A closed mesh (object frame, mm), its boundary and the medium inside.
+
+    mesh: the outer surface, which is all that scan, silhouettes and the truth of R_d know; inside: bodies in it, each
+    after the one around it.
+    """
 
     mesh: trimesh.Trimesh
     boundary: TwinBoundary
     medium: Medium
+    inside: tuple[Body, ...] = ()
+
+    def of_lasers(self, lasers: Sequence[int]) -> TwinObject:
+        """The object at some of its wavelengths, in this order; one may come more than once."""
+        bodies = tuple(body.of_lasers(lasers) for body in self.inside)
+        return TwinObject(self.mesh, self.boundary, self.medium.of_lasers(lasers), bodies)
+
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """Laser indices that share sigma_t and g exactly everywhere, so that one walk serves them."""
+        own = [body.medium for body in self.inside if isinstance(body.medium, OwnMedium)]
+        found: list[tuple[int, ...]] = []
+        for group in self.medium.groups():
+            names = {k: tuple((m.sigma_t[k], m.g[k]) for m in own) for k in group}
+            found += [tuple(k for k in group if names[k] == name) for name in dict.fromkeys(names.values())]
+        return tuple(found)
 
 
 def build_object(scene: Scene) -> TwinObject:
@@ -52,7 +74,14 @@ def build_object(scene: Scene) -> TwinObject:
     rough = surface.kind == "rough"
     boundary = TwinBoundary("rough", surface.eta, surface.alpha) if rough else TwinBoundary("matched", 1.0, 0.0)
     wavelengths = [laser.wavelength_nm for laser in scene.rig.lasers]
-    return TwinObject(mesh, boundary, build_medium(scene.object.medium, mesh, wavelengths))
+    outer, shells = mesh, list[Named]()
+    if isinstance(scene.object.shape, MeshFile):
+        outer, shells = shells_of(mesh, boundary.eta, boundary.alpha, "object.shape.file")
+    first = OBJECT + 1 + len(shells)
+    named = [*shells, *bodies_of(scene.object.inside, boundary.eta, len(wavelengths), _mesh, first)]
+    check_nesting(outer, named)
+    medium = build_medium(scene.object.medium, outer, wavelengths)
+    return TwinObject(outer, boundary, medium, tuple(body for _, body in named))
 
 
 def build_scan(scene: Scene, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -79,10 +108,11 @@ def build_scan(scene: Scene, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return remesh(mesh, vertices)
 
 
-def _mesh(shape: Shape) -> trimesh.Trimesh:
+def _mesh(shape: Shape, key: str = "object.shape") -> trimesh.Trimesh:
+    """The mesh of a shape. key: the shape's in the scene."""
     match shape:
         case MeshFile():
-            return read_mesh(shape.file)
+            return read_mesh(shape.file, f"{key}.file")
         case Pebble():
             mesh = shapes.pebble(shape)
         case Sphere():
@@ -95,5 +125,5 @@ def _mesh(shape: Shape) -> trimesh.Trimesh:
             mesh = blend(shape)
         case Extrusion():
             mesh = extrusion(shape)
-    require_size(mesh, None, "object.shape")
+    require_size(mesh, None, key)
     return mesh

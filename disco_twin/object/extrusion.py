@@ -9,8 +9,8 @@ import trimesh
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
-from disco_twin.scene.object_schema import Extrusion
 from disco_twin.scene.polygons import distance_to_sides, inside, sides
+from disco_twin.scene.shape_schema import Extrusion
 from hw.base.arrays import F64, I64
 from hw.base.errors import InputError
 

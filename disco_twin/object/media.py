@@ -68,13 +68,13 @@ def build_medium(config: MediumConfig, mesh: trimesh.Trimesh, wavelengths_nm: Se
 
 def _base(config: MediumConfig, mesh: trimesh.Trimesh, wavelengths_nm: Sequence[float]) -> Medium:
     lasers = len(wavelengths_nm)
-    g = tuple(float(x) for x in _per_wavelength(config.g, lasers))
+    g = tuple(float(x) for x in per_wavelength(config.g, lasers))
     low, high = np.array(mesh.bounds, dtype=float)
     base = config.base
     if isinstance(base, Grid):
         return _grid(base, mesh, lasers, g)
     if isinstance(base, Homogeneous):
-        sigma_t, albedo = _per_wavelength(base.sigma_t_per_mm, lasers), _per_wavelength(base.albedo, lasers)
+        sigma_t, albedo = per_wavelength(base.sigma_t_per_mm, lasers), per_wavelength(base.albedo, lasers)
     else:
         sigma_t, albedo = measured(base.name, wavelengths_nm)
     return Medium(_column(sigma_t).astype(np.float32), _column(albedo).astype(np.float32), low, high, g)
@@ -88,7 +88,7 @@ def _grid(base: Grid, mesh: trimesh.Trimesh, lasers: int, g: tuple[float, ...]) 
         albedo = _beside(density, base.albedo_file, lasers, "albedo", 0.0)
     else:
         assert base.albedo is not None  # the schema asks for exactly one of the two
-        albedo = _column(_per_wavelength(base.albedo, lasers))
+        albedo = _column(per_wavelength(base.albedo, lasers))
     low = density.low if base.low_mm is None else np.array(base.low_mm)
     high = density.high if base.high_mm is None else np.array(base.high_mm)
     if low is None or high is None:
@@ -156,8 +156,8 @@ def _with_features(config: MediumConfig, base: Medium, mesh: trimesh.Trimesh) ->
         if isinstance(feature, HollowCore):
             t = a = np.zeros((lasers, 1, 1, 1))
         else:
-            t = _column(_per_wavelength(feature.sigma_t_per_mm, lasers))
-            a = _column(_per_wavelength(feature.albedo, lasers))
+            t = _column(per_wavelength(feature.sigma_t_per_mm, lasers))
+            a = _column(per_wavelength(feature.albedo, lasers))
         sigma_s += weight * (t * a - sigma_s)
         sigma_a += weight * (t * (1 - a) - sigma_a)
         if forward is not None:
@@ -176,7 +176,7 @@ def _with_features(config: MediumConfig, base: Medium, mesh: trimesh.Trimesh) ->
 def _g_of(feature: Feature, base: Medium) -> F64:
     """(L,) asymmetries of a feature."""
     own = None if isinstance(feature, HollowCore) else feature.g
-    return _per_wavelength(base.g if own is None else own, len(base.g))
+    return per_wavelength(base.g if own is None else own, len(base.g))
 
 
 def _mean_cosines(sigma_s: F64, forward: F64, lasers: Sequence[Hashable]) -> F64:
@@ -200,7 +200,7 @@ def cell_centres(low: F64, high: F64, shape: tuple[int, ...]) -> F64:
     return np.column_stack([xx.ravel(), yy.ravel(), zz.ravel()])
 
 
-def _per_wavelength(value: ArrayLike, lasers: int) -> F64:
+def per_wavelength(value: ArrayLike, lasers: int) -> F64:
     """(L,) values from one for all lasers or one a laser (the scene's schema has checked the count)."""
     return np.array(np.broadcast_to(np.atleast_1d(np.asarray(value, float)), (lasers,)))
 

@@ -21,23 +21,26 @@ MARGIN = 1e-4  # of an edge, or of a triangle's height: nearer to its border it 
 FINE_TRIANGLES = 20_000  # truth is tallied on the mesh's vertices: triangles are cut in four until there are so many
 
 
-def read_mesh(path: Path) -> trimesh.Trimesh:
-    """A closed, outward oriented mesh in mm from a PLY, OBJ or STL file. Raises: InputError for anything else."""
-    mesh = load_mesh(path, KEY)
-    check_mesh(mesh, path)
+def read_mesh(path: Path, key: str = KEY) -> trimesh.Trimesh:
+    """A closed, outward oriented mesh in mm from a PLY, OBJ or STL file. key: of the file in the scene.
+
+    Raises: InputError for anything else.
+    """
+    mesh = load_mesh(path, key)
+    check_mesh(mesh, path, key)
     while len(mesh.faces) < FINE_TRIANGLES:
         mesh = trimesh.Trimesh(*trimesh.remesh.subdivide(mesh.vertices, mesh.faces), process=False)
     return mesh
 
 
-def check_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
+def check_mesh(mesh: trimesh.Trimesh, path: Path, key: str = KEY) -> None:
     """Refuse a mesh that light cannot be traced in, or that was not meant in mm. Raises: InputError."""
-    require_size(mesh, path, KEY)
-    require_closed(mesh, path, KEY)
-    _check_shells(mesh, path)
+    require_size(mesh, path, key)
+    require_closed(mesh, path, key)
+    _check_shells(mesh, path, key)
 
 
-def _check_shells(mesh: trimesh.Trimesh, path: Path) -> None:
+def _check_shells(mesh: trimesh.Trimesh, path: Path, key: str) -> None:
     """Refuse a closed, consistently oriented mesh whose shells do not bound a solid.
 
     A shell inside another one is a cavity and has to be oriented inwards; one inside a cavity is solid again.
@@ -46,7 +49,7 @@ def _check_shells(mesh: trimesh.Trimesh, path: Path) -> None:
     place = crossing(mesh)
     if place is not None:
         problem = f"the mesh intersects itself near {np.round(place, 2).tolist()} mm"
-        raise InputError(problem, file=path, key=KEY, remedy="unite its parts (a boolean union, or a voxel remesh)")
+        raise InputError(problem, file=path, key=key, remedy="unite its parts (a boolean union, or a voxel remesh)")
     parts = mesh.split(only_watertight=False)
     for part in parts:
         around = [o for o in parts if o is not part and o.contains(part.vertices[:1])[0]]
@@ -55,11 +58,11 @@ def _check_shells(mesh: trimesh.Trimesh, path: Path) -> None:
             continue
         where = f"the shell of {len(part.faces)} triangles around {np.round(part.bounds.mean(axis=0), 1).tolist()} mm"
         if len(parts) == 1:
-            raise InputError("the mesh is inside out", file=path, key=KEY, remedy=mending(path))
+            raise InputError("the mesh is inside out", file=path, key=key, remedy=mending(path))
         if cavity:
             problem, remedy = f"{where} lies inside another one and is not oriented inwards", "orient it as a cavity"
-            raise InputError(problem, file=path, key=KEY, remedy=f"{remedy}, or take it out")
-        raise InputError(f"{where} is inside out", file=path, key=KEY, remedy=mending(path))
+            raise InputError(problem, file=path, key=key, remedy=f"{remedy}, or take it out")
+        raise InputError(f"{where} is inside out", file=path, key=key, remedy=mending(path))
 
 
 def crossing(mesh: trimesh.Trimesh) -> F64 | None:

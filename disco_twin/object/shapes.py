@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from disco_twin.scene.object_schema import Box, Pebble, Sphere, Torus
+from disco_twin.scene.shape_schema import Box, Pebble, Sphere, Torus
 from hw.base.arrays import F64, I64
 
 SUBDIVISIONS = 5  # of an icosahedron: 10242 vertices, 20480 triangles

@@ -81,8 +81,10 @@ def predict(experiment: Experiment, shipped: Path) -> list[tuple[str, str]]:
     spot = spot_cost(experiment)
     seconds = simulation_seconds(experiment, spot, lights, cores)
     triangles, vertices = len(experiment.object.mesh.faces), len(experiment.scan.vertices)
+    inside = len(experiment.object.inside)
+    walls = f", {inside} surface{'s' if inside > 1 else ''} inside it" if inside else ""
     lines = [
-        ("scene", f"{scene.name}: {triangles} triangles, scan of {vertices} vertices"),
+        ("scene", f"{scene.name}: {triangles} triangles{walls}, scan of {vertices} vertices"),
         ("images", f"{images}: {plan.views} views, {len(plan.spots)} spots, {plan.lasers} lasers"),
         (
             "bytes",

@@ -1,186 +1,31 @@
-"""The schema of `[object]` and `[scan]` in a scene: shape, boundary, medium; the mesh that the pipeline is given.
+"""The schema of `[object]` and `[scan]` in a scene: boundary, medium, bodies inside; the scan that is handed on.
 
 Object frame, mm, wavelengths in the rig's order.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    Field,
-    SerializerFunctionWrapHandler,
-    field_validator,
-    model_serializer,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from disco_twin.scene.materials import MATERIALS
-from disco_twin.scene.polygons import inside, meeting
+from disco_twin.scene.shape_schema import Direction, Lean, Shape
 from hw.base.config import NearbyFile, Strict
-from pipeline.geometry.nominal_rig import Angle, Length, Point, Positive
-
-
-def _not_zero(vector: Point) -> Point:
-    if not any(vector):
-        raise ValueError("a direction cannot be zero")
-    return vector
-
+from pipeline.geometry.nominal_rig import Point, Positive
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Coefficient = Annotated[float, Field(ge=0, le=1e4)]
 PerWavelength = Coefficient | tuple[Coefficient, ...]  # one value for all lasers, or one a laser
 Albedo = Share | tuple[Share, ...]
 Asymmetry = Annotated[float, Field(gt=-1, lt=1)]
-Direction = Annotated[Point, AfterValidator(_not_zero)]  # of any length
-Size = tuple[Positive, Positive, Positive]
-Turn = tuple[Angle, Angle, Angle]
-Polygon = Annotated[tuple[tuple[Length, Length], ...], Field(min_length=3, max_length=64)]  # x, y of its corners
-
-
-class Lean(Strict):
-    """Keys in `LEFT_OUT` that a scene does not state are no part of its dump.
-
-    Results are known by the dump: those of scenes that state no such key stay valid although the schema has grown.
-    """
-
-    LEFT_OUT: ClassVar[tuple[str, ...]] = ()
-
-    @model_serializer(mode="wrap")
-    def _stated(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        found: dict[str, Any] = handler(self)
-        return {key: value for key, value in found.items() if key not in self.LEFT_OUT or value not in (None, (), [])}
-
-
-# ---------------------------------------------------------------- shape
-class MeshFile(Strict):
-    """A closed, outward oriented triangle mesh in mm (PLY, OBJ or STL), placed with its own coordinates."""
-
-    kind: Literal["mesh"]
-    file: NearbyFile
-
-
-class Pebble(Strict):
-    """A smooth stone with bumps and two concave dents, scaled to a bounding box that is centred on the origin."""
-
-    kind: Literal["pebble"]
-    size_mm: Size = (40.0, 36.0, 32.0)
-    seed: Annotated[int, Field(ge=0)] = 1
-
-
-class Sphere(Strict):
-    """A sphere around the origin."""
-
-    kind: Literal["sphere"]
-    radius_mm: Positive = 20.0
-
-
-class Box(Strict):
-    """A box around the origin, or a slab where one side is short."""
-
-    kind: Literal["box"]
-    size_mm: Size
-
-
-class Torus(Strict):
-    """A ring around the turntable's axis: not star shaped, and it sees itself."""
-
-    kind: Literal["torus"]
-    ring_radius_mm: Positive = 14.0
-    tube_radius_mm: Positive = 6.0
-
-    @model_validator(mode="after")
-    def _open_ring(self) -> Torus:
-        if self.tube_radius_mm >= self.ring_radius_mm:
-            raise ValueError("tube_radius_mm must be smaller than ring_radius_mm, the ring would cut itself")
-        return self
-
-
-class Ellipsoid(Strict):
-    """A part of a blend. `turn_deg` turns it about its own centre: about x, then y, then z."""
-
-    kind: Literal["ellipsoid"]
-    centre_mm: Point = (0.0, 0.0, 0.0)
-    radii_mm: Size
-    turn_deg: Turn = (0.0, 0.0, 0.0)
-    carve: bool = False
-
-
-class Capsule(Strict):
-    """A part of a blend: all balls between two, the radius linear in between (left out: the same at both ends)."""
-
-    kind: Literal["capsule"]
-    from_mm: Point
-    to_mm: Point
-    radius_mm: Positive
-    to_radius_mm: Positive | None = None
-    carve: bool = False
-
-    @model_validator(mode="after")
-    def _two_ends(self) -> Capsule:
-        length = math.dist(self.from_mm, self.to_mm)
-        if length <= abs(self.radius_mm - (self.to_radius_mm or self.radius_mm)):
-            raise ValueError("one end lies inside the other's ball; give an ellipsoid, or move to_mm away from from_mm")
-        return self
-
-
-class Blend(Strict):
-    """Ellipsoids and capsules, joined one after the other; one that has `carve` is taken out of what came before it.
-
-    Where surfaces of two parts meet, they run into each other over about `rounding_mm`.
-    """
-
-    kind: Literal["blend"]
-    parts: Annotated[
-        tuple[Annotated[Ellipsoid | Capsule, Field(discriminator="kind")], ...], Field(min_length=1, max_length=64)
-    ]
-    rounding_mm: Positive = 1.0
-
-    @model_validator(mode="after")
-    def _something_to_carve(self) -> Blend:
-        if self.parts[0].carve:
-            raise ValueError("parts[0] has nothing to carve: begin with a part that is there")
-        return self
-
-
-class Extrusion(Strict):
-    """A sharp-edged prism: an outline in x and y less its holes, from z = -height/2 to height/2, then turned.
-
-    Polygons run either way round. `turn_deg` turns about the origin: about x, then y, then z.
-    """
-
-    kind: Literal["extrusion"]
-    outline_mm: Polygon
-    holes_mm: Annotated[tuple[Polygon, ...], Field(max_length=16)] = ()
-    height_mm: Positive
-    turn_deg: Turn = (0.0, 0.0, 0.0)
-
-    @model_validator(mode="after")
-    def _rings(self) -> Extrusion:
-        rings = [np.array(ring) for ring in (self.outline_mm, *self.holes_mm)]
-        names = ["outline_mm", *(f"holes_mm[{i}]" for i in range(len(self.holes_mm)))]
-        found = meeting(rings)
-        if found is not None:
-            one, other, place = found
-            what = f"{names[one]} crosses or touches itself" if one == other else f"{names[one]} meets {names[other]}"
-            raise ValueError(f"{what} near {np.round(place, 1).tolist()} mm; draw rings that keep apart")
-        for i in range(1, len(rings)):
-            around = [k for k in range(len(rings)) if k != i and inside(rings[i][:1], rings[k : k + 1])[0]]
-            if around != [0]:
-                where = f"inside {names[around[-1]]}" if around and around[-1] else "outside outline_mm"
-                raise ValueError(f"{names[i]} lies {where}; draw holes inside the outline and outside each other")
-        return self
-
-
-Shape = Annotated[MeshFile | Pebble | Sphere | Box | Torus | Blend | Extrusion, Field(discriminator="kind")]
 
 
 # ---------------------------------------------------------------- boundary
 LEAST_ETA = 1.001  # Mitsuba takes no rough dielectric of 1
+LEAST_ALPHA = 0.02
 
 
 class BoundaryConfig(Strict):
@@ -188,7 +33,7 @@ class BoundaryConfig(Strict):
 
     kind: Literal["rough", "matched"] = "rough"
     eta: Annotated[float, Field(ge=1, le=3)] = 1.3
-    alpha: Annotated[float, Field(ge=0.02, le=1)] = 0.3
+    alpha: Annotated[float, Field(ge=LEAST_ALPHA, le=1)] = 0.3
 
     @field_validator("kind", mode="before")
     @classmethod
@@ -350,12 +195,69 @@ class MediumConfig(Strict):
                     yield prefix + name, value
 
 
-class ObjectConfig(Strict):
+# ---------------------------------------------------------------- bodies inside
+class Filling(Strict):
+    """What fills a body inside the object: one medium everywhere."""
+
+    sigma_t_per_mm: PerWavelength
+    albedo: Albedo
+    g: Asymmetry | tuple[Asymmetry, ...] = 0.0
+
+
+class BodyConfig(Lean):
+    """A body inside the object, or inside another body, with a wall of its own: a cavity, an inclusion.
+
+    eta: the index of what fills it, 1 of air; alpha: roughness of the wall, 0 for a smooth one. medium: "clear" neither
+    scatters nor absorbs, "object" is the object's own. The wall bends light by the index of both sides; where they are
+    the same, it only parts the media.
+    """
+
+    LEFT_OUT = ("inside",)
+    shape: Shape
+    centre_mm: Point = (0.0, 0.0, 0.0)
+    eta: Annotated[float, Field(ge=1, le=3)] = 1.0
+    alpha: Annotated[float, Field(ge=0, le=1)] = 0.0
+    medium: Filling | Literal["clear", "object"] = "clear"
+    inside: Annotated[tuple[BodyConfig, ...], Field(max_length=16)] = ()
+
+    @field_validator("alpha")
+    @classmethod
+    def _smooth_or_rough(cls, alpha: float) -> float:
+        if 0 < alpha < LEAST_ALPHA:
+            raise ValueError(f"a rough wall needs {LEAST_ALPHA} to 1; take 0 for a smooth one")
+        return alpha
+
+
+class ObjectConfig(Lean):
     """The scanned object."""
 
+    LEFT_OUT = ("inside",)
     shape: Shape
     boundary: BoundaryConfig = BoundaryConfig()
     medium: MediumConfig
+    inside: Annotated[tuple[BodyConfig, ...], Field(max_length=16)] = ()
+
+    @model_validator(mode="after")
+    def _seen_through_a_boundary(self) -> ObjectConfig:
+        if self.inside and self.boundary.kind == "matched":
+            raise ValueError(
+                "no walk connects to a camera through walls inside an object without a boundary; take "
+                "boundary.kind = 'rough', or a feature of kind 'hollow'"
+            )
+        return self
+
+    def per_wavelength(self) -> Iterator[tuple[str, tuple[float, ...]]]:
+        """Keys, below `object`, and values of everything that is given once a laser."""
+        yield from ((f"medium.{key}", values) for key, values in self.medium.per_wavelength())
+        waiting = [(f"inside[{i}]", body) for i, body in enumerate(self.inside)]
+        while waiting:
+            name, body = waiting.pop(0)
+            waiting += [(f"{name}.inside[{i}]", other) for i, other in enumerate(body.inside)]
+            if isinstance(body.medium, Filling):
+                for key in ("sigma_t_per_mm", "albedo", "g"):
+                    values = getattr(body.medium, key)
+                    if isinstance(values, tuple):
+                        yield f"{name}.medium.{key}", values
 
 
 # ---------------------------------------------------------------- scan

@@ -9,8 +9,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from disco_twin.scene.object_schema import Direction, ObjectConfig, ScanConfig
+from disco_twin.scene.object_schema import ObjectConfig, ScanConfig
 from disco_twin.scene.rig_schema import FaultsConfig, TwinRigConfig
+from disco_twin.scene.shape_schema import Direction
 from hw.base.config import Strict, load_toml
 from pipeline.geometry.nominal_rig import CameraConfig, Point
 from pipeline.reconstruct.settings import ReconstructConfig
@@ -114,9 +115,9 @@ class Scene(Strict):
     @model_validator(mode="after")
     def _consistent(self) -> Scene:
         lasers = len(self.rig.lasers)
-        for key, values in self.object.medium.per_wavelength():
+        for key, values in self.object.per_wavelength():
             if len(values) not in (1, lasers):
-                raise ValueError(f"object.medium.{key} has {len(values)} values for {lasers} lasers")
+                raise ValueError(f"object.{key} has {len(values)} values for {lasers} lasers")
         for light in self.relight.lights:
             if any(len(colour) != lasers for colour in _colours(light)):
                 raise ValueError(f"relight.lights: the colour of {light.name!r} needs {lasers} values, one a laser")

@@ -26,7 +26,7 @@ from disco_twin.light.tables import free_flight, medium_at, surroundings
 from disco_twin.light.transport import Transport
 from disco_twin.object import shapes
 from disco_twin.object.build import Medium, TwinObject
-from disco_twin.scene.object_schema import Pebble
+from disco_twin.scene.shape_schema import Pebble
 
 F64 = NDArray[np.float64]
 REPLICATES = 32

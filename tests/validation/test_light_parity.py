@@ -16,7 +16,7 @@ from significance import assert_z, z_of_replicates
 
 from disco_twin.light.sampling import Rng
 from disco_twin.light.sources import light_source
-from disco_twin.light.transport import mesh_scene
+from disco_twin.light.transport import shape_of
 from pipeline.relight.irradiance import hat_moments
 from pipeline.relight.lights import Directional, Light, Uniform, shipped_lights
 
@@ -36,7 +36,7 @@ def dented() -> trimesh.Trimesh:
 def photon_moments(light: Light, mesh: trimesh.Trimesh) -> np.ndarray:
     """(replicates, V) power that arrives first-hand at the vertices' hat functions, laser 0, from launched photons."""
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    scene = mesh_scene(vertices, faces, {"type": "diffuse"})
+    scene = mi.load_dict({"type": "scene", "object": shape_of("object", vertices, faces, {"type": "diffuse"})})
     source = light_source(light, float(np.linalg.norm(vertices, axis=1).max()) * 1.001, (0,))
     moments = np.zeros((REPLICATES, len(vertices)))
     for k in range(REPLICATES):

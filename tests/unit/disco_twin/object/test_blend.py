@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from disco_twin.object.blend import TRIANGLES, blend, blend_function
-from disco_twin.scene.object_schema import Blend
+from disco_twin.scene.shape_schema import Blend
 from hw.base.errors import InputError
 
 

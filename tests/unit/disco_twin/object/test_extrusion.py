@@ -10,8 +10,8 @@ from matplotlib.path import Path as Outline
 from scipy.spatial.transform import Rotation
 
 from disco_twin.object.extrusion import extrusion
-from disco_twin.scene.object_schema import Extrusion
 from disco_twin.scene.polygons import distance_to_sides, inside
+from disco_twin.scene.shape_schema import Extrusion
 from hw.base.errors import InputError
 
 Ring = tuple[tuple[float, float], ...]

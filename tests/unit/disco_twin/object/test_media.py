@@ -13,7 +13,8 @@ import trimesh
 from disco_twin.object import shapes
 from disco_twin.object.media import Medium, build_medium, cell_centres
 from disco_twin.object.mesh import depth
-from disco_twin.scene.object_schema import Box, MediumConfig, Sphere
+from disco_twin.scene.object_schema import MediumConfig
+from disco_twin.scene.shape_schema import Box, Sphere
 from hw.base.config import check
 from hw.base.errors import InputError
 

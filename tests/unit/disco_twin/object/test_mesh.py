@@ -12,7 +12,7 @@ import trimesh
 from disco_twin.object import shapes
 from disco_twin.object.mesh import closest, depth, hat_basis, read_mesh
 from disco_twin.object.remesh import remesh
-from disco_twin.scene.object_schema import Pebble, Sphere
+from disco_twin.scene.shape_schema import Pebble, Sphere
 from hw.base.errors import InputError
 
 PEBBLE = shapes.pebble(Pebble(kind="pebble"))

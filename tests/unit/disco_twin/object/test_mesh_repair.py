@@ -14,7 +14,7 @@ from disco_twin.cli.app import main
 from disco_twin.object import shapes
 from disco_twin.object.mesh import distance_to, read_mesh
 from disco_twin.object.mesh_repair import mend
-from disco_twin.scene.object_schema import Pebble
+from disco_twin.scene.shape_schema import Pebble
 from hw.base.errors import DiscoError, InputError
 
 PEBBLE = shapes.pebble(Pebble(kind="pebble"))

@@ -14,7 +14,7 @@ from mesh_writers import L, obj, prism
 from disco_twin.object import shapes
 from disco_twin.object.mesh import depth, read_mesh
 from disco_twin.object.remesh import remesh
-from disco_twin.scene.object_schema import Box, Pebble, Sphere, Torus
+from disco_twin.scene.shape_schema import Box, Pebble, Sphere, Torus
 from hw.base.errors import InputError
 
 PEBBLE = shapes.pebble(Pebble(kind="pebble"))

@@ -8,7 +8,7 @@ import trimesh
 
 from disco_twin.object import shapes
 from disco_twin.object.mesh import depth
-from disco_twin.scene.object_schema import Box, Pebble, Sphere, Torus
+from disco_twin.scene.shape_schema import Box, Pebble, Sphere, Torus
 
 
 def all_shapes() -> dict[str, trimesh.Trimesh]:
