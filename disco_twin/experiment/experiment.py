@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 
 from disco_twin.experiment.object_pixels import ObjectPixels
+from disco_twin.object.bodies import OwnMedium
 from disco_twin.object.build import TwinObject, build_object, build_scan
 from hw.base.arrays import Bool
 from hw.base.errors import InputError
@@ -21,6 +22,9 @@ from pipeline.plan.visibility import warn_of_frame
 if TYPE_CHECKING:
     from disco_twin.light.transport import Transport
     from disco_twin.scene.scene import Scene  # its settings of the reconstruction are no part of what is simulated
+
+
+ROUGH = 0.005  # of a free path: rounding of places that shows
 
 
 class Experiment:
@@ -47,7 +51,9 @@ class Experiment:
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What is no error, but should be known before the capture: cameras that do not see the whole object."""
+        """What is no error, but should be known before the capture: cameras that do not see the whole object, media too
+        dense for single precision.
+        """
         rig = self.scene.rig
         angles = [float(angle) for angle in np.deg2rad(rig.turntable_angles_deg)]
         lines = [
@@ -57,7 +63,7 @@ class Experiment:
             warn_of_frame(view, self.scan, f"relight.views[{i}]", f"the held-out view {view.name!r}")
             for i, view in enumerate(self.scene.relight.views)
         ]
-        return tuple(line for line in lines if line is not None)
+        return tuple(line for line in (*lines, rounding_warning(self.object)) if line is not None)
 
     @cached_property
     def transport(self) -> Transport:
@@ -98,6 +104,20 @@ class Experiment:
                 allowed=f"inside {low.round(1).tolist()} .. {high.round(1).tolist()}", remedy="move or turn the plane",
             )  # fmt: skip
         return np.asarray(beyond)
+
+
+def rounding_warning(obj: TwinObject) -> str | None:
+    """A line where free paths are so short that single precision shows; None elsewhere (docs/decisions/0133)."""
+    own = [max(body.medium.sigma_t) for body in obj.inside if isinstance(body.medium, OwnMedium)]
+    sigma_t, reach = max(float(obj.medium.sigma_t.max()), *own, 0.0), float(np.abs(obj.mesh.bounds).max())
+    share = sigma_t * float(np.spacing(np.float32(reach)))
+    if share < ROUGH:
+        return None
+    problem = (
+        f"free paths of {1 / sigma_t:.1g} mm are but {1 / share:.0f} steps of single precision {reach:.0f} mm from"
+    )
+    effect = f"what leaves the object is off by up to about {100 * share:.1g} %"
+    return f"{problem} the origin: {effect}. Remedy: a smaller object around the origin, or a lower sigma_t"
 
 
 def mm_per_pixel(camera: CameraConfig) -> float:

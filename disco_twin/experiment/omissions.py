@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from disco_twin.experiment.experiment import Experiment
+from disco_twin.object.bodies import OwnMedium
 
 
 def left_out_by_the_twin(experiment: Experiment) -> list[dict[str, str]]:
@@ -17,7 +18,8 @@ def left_out_by_the_twin(experiment: Experiment) -> list[dict[str, str]]:
         out.append(("a walk per wavelength", "sigma_t and g are the same at all wavelengths: one walk serves them"))
     if experiment.object.boundary.kind == "matched":
         out.append(("boundary sampling", "the object is index-matched"))
-    if medium.g_voxels is None and all(g == 0 for g in medium.g):
+    own = [g for body in experiment.object.inside if isinstance(body.medium, OwnMedium) for g in body.medium.g]
+    if medium.g_voxels is None and all(g == 0 for g in (*medium.g, *own)):
         out.append(("phase function sampling", "scattering is isotropic (g = 0)"))
     faults = [name for name, on in scene.rig.faults.model_dump().items() if not on]
     if faults:

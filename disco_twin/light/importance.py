@@ -33,7 +33,8 @@ STEEPEST = 32.0  # ratio of neighbouring cells' targets: where diffusion falls t
 
 @dataclass(frozen=True)
 class Splitting:
-    """Where each tag's light enters, (T, 3) in mm, and how many times the collisions of an unsplit walk to spend.
+    """Where each tag's light enters, (T, 3) or (T, P, 3) in mm for P places alike, and how many times the collisions of
+    an unsplit walk to spend.
 
     What effort buys: docs/decisions/0050. part: of images that plain and split walks make together
     (`splitting.counted`) whose these are, with `plain` of the former to each of the latter; their sum is the whole.
@@ -61,7 +62,8 @@ class Diffusion:
 
     filled: (n, n, n) whether the cell's middle lies in the object; number: (n, n, n) its unknown, the nearest one's
     outside; both indexed [z, y, x]; low: corner in mm; cell: edge in mm; factor: solves for the fluence of 1 W, 1/mm^2;
-    sigma_t: (unknowns,) 1/mm; leak: power that leaves per area of the surface and fluence.
+    sigma_t, absorption, reduced: (unknowns,) 1/mm, the latter sigma_s'; leak: power that leaves per area of the surface
+    and fluence.
     """
 
     filled: Bool
@@ -70,6 +72,8 @@ class Diffusion:
     cell: float
     factor: Any
     sigma_t: F64
+    absorption: F64
+    reduced: F64
     leak: float
 
     def unknowns(self, points: ArrayLike) -> I64:
@@ -79,15 +83,41 @@ class Diffusion:
         return np.asarray(self.number[index[:, 2], index[:, 1], index[:, 0]])
 
     def fluence(self, points: ArrayLike) -> F64:
-        """(N, n, n, n) fluence of N sources of 1 W at `points` (N, 3)."""
-        cells = self.unknowns(points)
+        """(N, n, n, n) fluence of N sources of 1 W, each at `points` (N, 3) or shared among places (N, P, 3)."""
+        places = np.asarray(points, float).reshape(len(np.asarray(points)), -1, 3)
+        cells = self.unknowns(places.reshape(-1, 3)).reshape(places.shape[:2])
         right = np.zeros((self.factor.shape[0], len(cells)))
-        right[cells, np.arange(len(cells))] = 1.0
+        np.add.at(right, (cells, np.arange(len(cells))[:, None]), 1.0 / cells.shape[1])
         return np.ascontiguousarray(np.moveaxis(self.factor.solve(right)[self.number], -1, 0))
 
     def collisions(self, points: ArrayLike) -> float:
         """How often a photon that enters at one of `points` (N, 3) is scattered before it leaves, in the mean."""
-        return float(self.spread(points) @ self.sigma_t) * self.cell**3
+        cells = self.unknowns(points)
+        reached, spent = self.below_surface(cells)
+        right = np.bincount(cells, reached, minlength=self.factor.shape[0]) / len(cells)
+        inner = float(self.factor.solve(right) @ self.sigma_t) * self.cell**3
+        return inner + float((spent * self.sigma_t[cells]).mean())
+
+    def below_surface(self, cells: I64) -> tuple[F64, F64]:
+        """Light that enters scatters first a transport free path below the surface, often far above the cell's middle.
+
+        (N,) share that reaches the middle of its cell, and (N,) mm flown until then by all, in the slab of half a cell
+        between the surface, which leaks, and the middle, which is held dark: D u'' = sigma_a u, D u'(0) = leak u(0).
+        """
+        transport = np.maximum(self.absorption[cells] + self.reduced[cells], 1e-12)
+        d, half = 1 / (3 * transport), self.cell / 2
+        start = np.minimum(1 / transport, half)
+        k = np.maximum(np.sqrt(self.absorption[cells] / d), 1e-4 / half)
+        conduct = self.leak / (k * d)
+
+        def from_surface(z: F64 | float) -> F64:
+            """cosh(k z) + conduct sinh(k z), times 2 exp(-k z)."""
+            return np.asarray(1 + conduct + (1 - conduct) * np.exp(-2 * k * z))
+
+        left = np.exp(k * (start - half))
+        reached = left * from_surface(start) / from_surface(half)
+        leaked = conduct * np.exp(-k * start) * (1 - left**2) / from_surface(half)
+        return reached, np.maximum(1 - reached - leaked, 0) / (k**2 * d)
 
     def spread(self, points: ArrayLike) -> F64:
         """(cells,) fluence of 1 W shared among the `points` (N, 3)."""
@@ -171,7 +201,10 @@ def diffusion(obj: TwinObject, laser: int, cells: int = CELLS) -> Diffusion:
     options = {"SymmetricMode": True}
     factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
     nearest = ndimage.distance_transform_edt(~filled, return_indices=True, return_distances=False)
-    return Diffusion(filled, number[tuple(nearest)], corner, cell, factor, absorption + scattering, float(leak))
+    sigma_t = absorption + scattering
+    return Diffusion(
+        filled, number[tuple(nearest)], corner, cell, factor, sigma_t, absorption, reduced, float(leak)
+    )  # fmt: skip
 
 
 def view_targets(estimate: Diffusion, views: Views) -> F64:

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import sparse
 
-from disco_twin.light.truth import REPLICATES, hat_areas
+from disco_twin.light.truth import REPLICATES, hat_areas, places_of
 from disco_twin.object.build import TwinObject
 from hw.base.arrays import F32, F64, I64
 from hw.base.files import load_arrays, save_arrays
@@ -83,7 +83,7 @@ def moments(transport: Transport, basis: sparse.csr_matrix, columns: I64, laser:
 
     hats = basis[:, columns].toarray().T
     tangent, axes = _frames(transport, hats)
-    entries = (hats @ transport.vertices) / hats.sum(axis=1, keepdims=True)
+    entries = places_of(hats, transport.object.mesh)
     replicate = np.tile(np.arange(REPLICATES), len(columns))
     names = (np.repeat(columns, REPLICATES) * REPLICATES + replicate).astype(np.uint32)
     hats, entries, ways = (np.repeat(x, REPLICATES, axis=0) for x in (hats, entries, axes))

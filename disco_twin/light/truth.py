@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import trimesh
 from scipy import sparse
 
 from disco_twin.light.balance import EnergyBalance
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 
 REPLICATES = 8
+ENTRIES = 256  # places that stand for a hat function in its weight windows
 FORMAT_VERSION = 3
 ARRAYS = ("columns", "replicates", "area")
 
@@ -76,6 +78,13 @@ def hat_areas(transport: Transport, basis: sparse.csr_matrix) -> F64:
     return np.asarray(basis.T @ RayMesh.of(transport.object.mesh).vertex_areas)
 
 
+def places_of(hats: F64, mesh: trimesh.Trimesh) -> F64:
+    """(n, ENTRIES, 3) places, alike, over which the functions (n, V) at the fine mesh's vertices are spread."""
+    share = np.cumsum(hats * RayMesh.of(mesh).vertex_areas, axis=1)
+    steps = (np.arange(ENTRIES) + 0.5) / ENTRIES
+    return np.stack([np.asarray(mesh.vertices)[np.searchsorted(row, steps * row[-1])] for row in share])
+
+
 def truth_columns(transport: Transport, basis: sparse.csr_matrix, columns: I64, walks: int, seed: int) -> Truth:
     """M[u, v] = (escaped power weighted by hat v) / area of v, per watt that arrives over hat u.
 
@@ -85,8 +94,7 @@ def truth_columns(transport: Transport, basis: sparse.csr_matrix, columns: I64, 
     from disco_twin.light.sources import HatSource  # what is stored can be read without a renderer
 
     hats = np.repeat(basis[:, columns].toarray().T, REPLICATES, axis=0)
-    entries = (hats @ transport.vertices) / hats.sum(axis=1, keepdims=True)
-
+    entries = places_of(hats, transport.object.mesh)
     replicate = np.tile(np.arange(REPLICATES), len(columns))
     names = (np.repeat(columns, REPLICATES) * REPLICATES + replicate).astype(np.uint32)
     per_replicate = max(1, round(walks / REPLICATES))

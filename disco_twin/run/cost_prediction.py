@@ -55,17 +55,24 @@ def simulation_seconds(experiment: Experiment, spot: SpotCost, lights: int, core
 
 
 def copies_at_start(experiment: Experiment) -> float:
-    """Into how many copies a photon of the truth's columns is split where it starts, in the mean: light enters over a
-    whole hat function, its windows are made for the middle of it. Many where light dies within one.
-    """
+    """Into how many copies a photon of the truth's columns is split where it starts, in the mean."""
     estimate, scan = coarse_estimate(experiment), experiment.scan
     chosen = lit_vertices(experiment)
-    targets = window_targets(estimate.fluence(scan.vertices[chosen]), estimate.filled, EFFORT)[:, estimate.filled]
     found = []
-    for vertex, target in zip(chosen, targets, strict=True):
-        middles = (scan.vertices[vertex] + scan.vertices[scan.vertex_neighbors[vertex]]) / 2
-        found.append((1 / target[estimate.unknowns(middles)]).mean())
+    for vertex in chosen:
+        corners = scan.vertices[scan.faces[(scan.faces == vertex).any(axis=1)]]
+        places = corners.mean(axis=1) / 4 * 3 + scan.vertices[vertex] / 4  # of triangles' shares of the hat
+        target = window_targets(estimate.fluence(places[None]), estimate.filled, EFFORT)[0, estimate.filled]
+        found.append((1 / target[estimate.unknowns(places)]).mean())
     return float(np.mean(found))
+
+
+def duration(seconds: float) -> str:
+    """About how long, in minutes, hours or days."""
+    for unit, length in (("minutes", 60.0), ("hours", 3600.0)):
+        if seconds < 100 * length:
+            return f"about {seconds / length:.1f} {unit}" if seconds >= 0.1 * length else f"less than .1 {unit}"
+    return f"about {seconds / 86400:.3g} days"
 
 
 def predict(experiment: Experiment, shipped: Path) -> list[tuple[str, str]]:
@@ -96,7 +103,7 @@ def predict(experiment: Experiment, shipped: Path) -> list[tuple[str, str]]:
     if scene.rig.faults.deviation:
         targets = sum(len(make_targets(scene.rig, c)[1]) for c in range(len(scene.rig.cameras)))
         lines.insert(2, ("calibration", f"{targets} images of chessboards and of a white plate"))
-    lines += [(name, f"about {value / 60:.1f} minutes on {cores} cores") for name, value in seconds.items() if value]
+    lines += [(name, f"{duration(value)} on {cores} cores") for name, value in seconds.items() if value]
     if not lights:
         lines.append(("references", "none to render: they lie beside the scene"))
     needed = walks_below_camera(scene)

@@ -104,7 +104,7 @@ def test_references_beside_the_scene_cost_nothing(experiment: Experiment, tmp_pa
     assert "none to render" in there["references"]
     assert "minutes" in dict(predict(experiment, tmp_path))["references"]
     more = changed(experiment, reference_noise=experiment.scene.simulation.reference_noise / 10)
-    assert "minutes" in dict(predict(more, shipped_references(SCENE, "quick")))["references"]
+    assert "hours" in dict(predict(more, shipped_references(SCENE, "quick")))["references"]
 
 
 def test_the_command_warns_of_cameras_that_do_not_see_the_whole_object(
