@@ -57,19 +57,21 @@ SPOTS = 49  # 2 cameras x 3 angles: 6 silhouettes and 2 x 3 lasers x 49 spots, 3
 class Glow:
     """A response source: an exponential spot on a textured object, at the angle and place of the aim."""
 
+    size, scale = SIZE, 1.0  # pixels, and how many of them are one of the small images'
+
     def prepare(self, aims: Sequence[Aim]) -> None:
         """Nothing to work ahead."""
 
     def image(self, camera: int, aim: Aim, laser: int) -> NDArray[np.float32]:
         """(H, W) radiance per watt."""
-        row, column = np.mgrid[: SIZE[0], : SIZE[1]]
+        row, column = np.mgrid[: self.size[0], : self.size[1]] / self.scale
         distance = np.hypot(row - 15 - (aim.v - 2048) / 40, column - 24 - (aim.u - 2048) / 20)
         texture = 1 + 0.2 * np.sin(column / 3 + aim.angle) * np.cos(row / 4 + camera)
         return np.asarray(0.03 * texture * np.exp(-distance / (2 + laser + camera)), np.float32)
 
     def silhouette(self, camera: int, angle: int) -> NDArray[np.float32]:
         """(H, W) radiance."""
-        return np.full(SIZE, 1e-6 * (1 + camera + angle), np.float32)
+        return np.full(self.size, 1e-6 * (1 + camera + angle), np.float32)
 
 
 def plan() -> Plan:
@@ -149,13 +151,13 @@ def undisturbed(folder: Path) -> Undisturbed:
     emulation = Emulation(TwinRig(RIG, Glow(), SEED), clock)
     sent: Counter[str] = Counter()
     for name, line in emulation.cables.items():
-        setattr(line, "receive", _counting(line.receive, name, sent))  # noqa: B010 - a spy on one line
+        setattr(line, "receive", counting(line.receive, name, sent))  # noqa: B010 - a spy on one line
     capture(emulation.serial_rig(), plan(), folder)
     assert emulation.bench.hazards == []
     return Undisturbed(folder, clock.now(), dict(sent))
 
 
-def _counting(receive: Callable[[bytes], None], name: str, sent: Counter[str]) -> Callable[[bytes], None]:
+def counting(receive: Callable[[bytes], None], name: str, sent: Counter[str]) -> Callable[[bytes], None]:
     def counted(data: bytes) -> None:
         sent[name] += 1
         receive(data)

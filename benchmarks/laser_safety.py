@@ -251,6 +251,7 @@ def _connected(context: Any, emulation: Emulation, urls: dict[str, str], folder:
         return Trial("connect", True, _until_dark(watch, opened[0]), max(0.0, _told(stamps, opened[0] - 1.0) - 1e3))
     finally:
         setattr(line, "opened", before)  # noqa: B010
+        child.join(10.0)  # it closes the port
         _end(child)
         watch.close()
 

@@ -7,7 +7,6 @@ board, an emulated one is not reset by that. On TCP a connection is an opening.
 from __future__ import annotations
 
 import logging
-import math
 import os
 import pty
 import selectors
@@ -22,7 +21,7 @@ from disco_twin.firmware.wire import Cable
 
 log = logging.getLogger(__name__)
 
-POLL_S, IDLE_S = 0.001, 0.02  # while an answer is on its way, and otherwise
+IDLE_S = 0.02
 
 
 class PtyPort:
@@ -155,9 +154,10 @@ class Server:
                         self._send(self._cables[port_name], port.fd)
 
     def _pause(self) -> float:
+        """Until the next answer arrives."""
         with self._lock:
-            coming = any(cable.next_arrival() < math.inf for cable in self._cables.values())
-        return POLL_S if coming else IDLE_S
+            left = (cable.next_arrival() - cable.clock.now() for cable in self._cables.values())
+            return min(max(0.0, min(left, default=IDLE_S)), IDLE_S)
 
     def _send(self, cable: Cable, fd: int) -> None:
         data = cable.deliver(4096, 0.0)

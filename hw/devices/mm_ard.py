@@ -7,7 +7,7 @@ for an argument (1 s), and a new beginning. Setting a value twice does no harm.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from hw.base.errors import DeviceRefused, Garbled, InputError, NoAnswer, WrongDevice
 from hw.safety.signals import uninterrupted
@@ -51,12 +51,17 @@ class MirrorBoard:
         link.clock.sleep(BOOT_S)
         self.version = self._identify()
         self.shut()
-        self._exchange(bytes([NO_BLANKING]), bytes([NO_BLANKING]))
+        self._exchange(bytes([NO_BLANKING]), [NO_BLANKING])
 
     # ---- talking
 
-    def _exchange(self, command: bytes, echo: bytes, answer: int = 0) -> bytes:
-        """Send, expect the echo and `answer` more bytes; tried again, since every command may be given twice."""
+    def _exchange(self, command: bytes, answer: Sequence[int | None]) -> bytes:
+        """Send, and expect these bytes; tried again, since every command may be given twice.
+
+        Several commands may be sent together, which saves a way to and fro for each: the board's buffer has 64 bytes.
+
+        Returns: what came in the places of None.
+        """
 
         def attempt() -> bytes:
             if self._owed:
@@ -64,12 +69,13 @@ class MirrorBoard:
             self._inbox.clear()
             self._owed = True
             self.link.write(command)
-            got = self._receive(len(echo) + answer, command)
-            if got[: len(echo)] != echo:
-                problem = f"answered {command.hex(' ')} with {got.hex(' ')} instead of {echo.hex(' ')}"
+            got = self._receive(len(answer), command)
+            if any(wanted not in (None, byte) for wanted, byte in zip(answer, got, strict=True)):
+                expected = " ".join("--" if wanted is None else f"{wanted:02x}" for wanted in answer)
+                problem = f"answered {command.hex(' ')} with {got.hex(' ')} instead of {expected}"
                 raise self.link.error(Garbled, problem, "check cable and grounding of the board")
             self._owed = False
-            return got[len(echo) :]
+            return bytes(byte for wanted, byte in zip(answer, got, strict=True) if wanted is None)
 
         def recover() -> None:
             self._lost()
@@ -97,11 +103,11 @@ class MirrorBoard:
     def _identify(self) -> int:
         self._inbox.clear()
         try:
-            self._exchange(bytes([IDENTIFY]), IDENTITY)
+            self._exchange(bytes([IDENTIFY]), list(IDENTITY))
         except (NoAnswer, Garbled) as error:
             raise self.link.wrong_device(f"is not an MM-Ard board: asked {IDENTIFY}, {self.link.heard()}") from error
         version = self._line(VERSION)
-        channels = self._exchange(bytes([CHANNELS]), bytes([CHANNELS]), 1)[0] if version >= 5 else 0
+        channels = self._exchange(bytes([CHANNELS]), [CHANNELS, None])[0] if version >= 5 else 0
         if channels < 2:
             problem = f"(MM-Ard version {version}) was built for {channels} DAC channels and would ignore the mirrors"
             remedy = "build AOTFcontroller.ino, version 5 or newer, with TLV5618 defined"
@@ -142,7 +148,7 @@ class MirrorBoard:
                     remedy="aim at another one",
                 )
             command = bytes([SET_DAC, channel, value >> 8, value & 0xFF])
-            self._exchange(command, command)
+            self._exchange(command, list(command))
 
     def set_lines(self, pattern: int) -> None:
         """The TTL lines as bits 0 .. 5; read back, since the echo does not contain them.
@@ -162,8 +168,8 @@ class MirrorBoard:
         if self._owed and not pattern:
             self.darken()  # getting back into step takes a second
         for _ in range(ATTEMPTS):
-            self._exchange(bytes([*RESTART, SET_LINES, pattern]), bytes([SET_LINES]))
-            found = self.lines()
+            command = bytes([*RESTART, SET_LINES, pattern, GET_LINES])
+            found = self._exchange(command, [SET_LINES, GET_LINES, None])[0] & (1 << LINES) - 1
             if found == pattern:
                 return
         if pattern:
@@ -182,7 +188,7 @@ class MirrorBoard:
 
     def lines(self) -> int:
         """The TTL lines as they are."""
-        return self._exchange(bytes([GET_LINES]), bytes([GET_LINES]), 1)[0] & (1 << LINES) - 1
+        return self._exchange(bytes([GET_LINES]), [GET_LINES, None])[0] & (1 << LINES) - 1
 
     def counts(self, pin: int) -> int:
         """The 10-bit ADC's value at an analogue pin: the median of three readings.
@@ -193,11 +199,8 @@ class MirrorBoard:
         """
         if not 0 <= pin < PINS:
             raise InputError("no such analogue pin", value=pin, allowed=f"0 to {PINS - 1}", remedy="read one of these")
-        return sorted(self._sample(pin) for _ in range(3))[1]
-
-    def _sample(self, pin: int) -> int:
-        high, low = self._exchange(bytes([READ_PIN, pin]), bytes([READ_PIN, pin]), 2)
-        return min(high << 8 | low, ADC_TOP)
+        read = self._exchange(bytes([READ_PIN, pin] * 3), [READ_PIN, pin, None, None] * 3)
+        return min(sorted(high << 8 | low for high, low in zip(read[::2], read[1::2], strict=True))[1], ADC_TOP)
 
     def close(self) -> None:
         """Shut every line as far as the board still listens, and give the port back; Ctrl-C waits until then."""

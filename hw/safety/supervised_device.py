@@ -108,6 +108,7 @@ class SupervisedDevice:
             except StopIteration as end:
                 return bool(end.value)
             return None
+        self._to_host = self._to_host or self._read(ready)
         try:
             if self.host.fileno() in ready:
                 self._to_device = self.host.recv(4096, socket.MSG_DONTWAIT)
@@ -123,7 +124,6 @@ class SupervisedDevice:
             return self.make_dark()
         if self._to_device:
             self._to_device = self._write(self._to_device)
-        self._to_host += self._read(ready)
         return None
 
     def make_dark(self) -> bool | None:

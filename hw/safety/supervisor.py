@@ -33,16 +33,22 @@ READY = b"\x06"
 TICK_S = 0.01  # how often the program is looked after
 SILENCE_S = 3.0  # without a beat; beats come every 0.1 s, and a renderer in the program may hold them up for 1 s
 REALTIME = 10  # a priority above all ordinary processes
+PF_EXITING = 4  # of Linux
 LOCK_ALL = 3  # MCL_CURRENT | MCL_FUTURE
 
 
 def stopped(pid: int) -> bool:
-    """Whether a process is stopped: Ctrl-Z, SIGSTOP or a debugger. Always False where there is no /proc."""
+    """Whether a process is stopped (Ctrl-Z, SIGSTOP, a debugger) or about to die. Always False where there is no /proc.
+
+    One that got SIGKILL on a busy machine keeps its sockets until it has had a processor to give its memory back.
+    """
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(errors="replace")
     except OSError:
         return False
-    return fields.rpartition(")")[2].split()[0] in "Tt"  # the name, in brackets, may hold anything
+    state, *numbers = fields.rpartition(")")[2].split()  # the name, in brackets, may hold anything
+    exiting, pending = map(int, [*numbers[5:6], *numbers[27:28], "0", "0"][:2])  # proc_pid_stat(5)
+    return state in "Tt" or bool(exiting & PF_EXITING) or bool(pending & 1 << signal.SIGKILL - 1)
 
 
 class Supervisor:
@@ -76,7 +82,7 @@ class Supervisor:
         if os.getppid() != self._program:
             return "the program was killed"
         if stopped(self._program):
-            return "the program was stopped (Ctrl-Z or SIGSTOP), and everything was made dark for that time"
+            return "the program was stopped (Ctrl-Z or SIGSTOP), and everything made dark for that time"
         if self.told_to_end:
             return "the supervisor was told to end"
         if self._lifeline.fileno() in ready:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Self
 
 from hw.base.errors import DiscoError, InputError
 from hw.interface import Rig, gate_open
@@ -21,6 +23,8 @@ from pipeline.stream.layout import ImageMeta
 from pipeline.stream.stream import StreamReader, StreamWriter
 
 log = logging.getLogger(__name__)
+
+SMALL = 1 << 15  # pixels of an image that is stored sooner than it is handed over
 
 Progress = Callable[[int, int], None]  # images stored, images of the plan
 
@@ -46,9 +50,9 @@ def capture(rig: Rig, plan: Plan, folder: Path, progress: Progress | None = None
             log.info("capture: image %d of %d into %s", resumed_at, len(plan), folder)
             with interruptible() as interruption:
                 try:
-                    with rig:
+                    with Storing(stream, progress) as storing, rig:
                         _restore(rig, stream, sensor)
-                        _sweep(rig, stream, progress)
+                        _sweep(rig, stream, storing)
                 except KeyboardInterrupt:
                     raise _interrupted(stream) from None
                 except DiscoError:
@@ -71,7 +75,63 @@ def _require_match(rig: Rig, plan: Plan) -> None:
                          remedy="use the rig that the plan was made for")  # fmt: skip
 
 
-def _sweep(rig: Rig, stream: StreamWriter, progress: Progress | None) -> None:
+class Storing:
+    """Stores each image while the next one is exposed: encoding takes half a frame, and nothing else is done then.
+
+    Leaving it stores the last image, whatever ended the block; the rig is dark by then.
+    """
+
+    def __init__(self, stream: StreamWriter, progress: Progress | None) -> None:
+        self._stream, self._progress = stream, progress
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="store")
+        self._taken: tuple[ImageAddress, RawImage, ImageMeta] | None = None
+        self._stored: Future[None] | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        with uninterrupted(), self._worker:
+            try:
+                self.finish()
+            except DiscoError as refused:  # the disk; where another error has ended the block, that is the reason
+                if error is None:
+                    raise
+                log.error("%s", refused)
+
+    def put(self, address: ImageAddress, raw: RawImage, meta: ImageMeta) -> None:
+        """Keep an image that was taken, once the one before is stored; a small one is stored at once.
+
+        Raises: StorageError, of the one before, or of this one.
+        """
+        self.finish()
+        if raw.charge.size >= SMALL:
+            self._taken = (address, raw, meta)
+            return
+        with uninterrupted():
+            self._stream.append(address, raw, meta)
+        self._report()
+
+    def begin(self) -> None:
+        """Store what was taken, in the background."""
+        taken, self._taken = self._taken, None
+        if taken is not None:
+            self._stored = self._worker.submit(self._stream.append, *taken)
+
+    def finish(self) -> None:
+        """Wait until everything is stored, and report it. Raises: StorageError."""
+        self.begin()
+        stored, self._stored = self._stored, None
+        if stored is not None:
+            stored.result()
+            self._report()
+
+    def _report(self) -> None:
+        if self._progress is not None:
+            self._progress(len(self._stream), len(self._stream.plan))
+
+
+def _sweep(rig: Rig, stream: StreamWriter, storing: Storing) -> None:
     plan = stream.plan
     announced = checked = None
     for index in range(len(stream), len(plan)):
@@ -86,11 +146,7 @@ def _sweep(rig: Rig, stream: StreamWriter, progress: Progress | None) -> None:
             rig.announce([plan.spots[i] for i in plan.spots_at(plan.angle_of(address.view))])
             announced = address.view
             raise_if_interrupted()
-        image = _take(rig, plan, address)
-        with uninterrupted():
-            stream.append(address, *image)
-        if progress is not None:
-            progress(index + 1, len(plan))
+        storing.put(address, *_take(rig, plan, address, storing.begin))
 
 
 def _check_lasers(rig: Rig, stream: StreamWriter, view: int) -> None:
@@ -121,13 +177,17 @@ def _restore(rig: Rig, stream: StreamWriter, sensor: Sensor | None) -> None:
     rig.resume_at(meta.time_s)
 
 
-def _take(rig: Rig, plan: Plan, address: ImageAddress) -> tuple[RawImage, ImageMeta]:
-    """One image and the rig's state; the time is read last, when nothing of this image remains to be done."""
+def _take(rig: Rig, plan: Plan, address: ImageAddress, exposing: Callable[[], None]) -> tuple[RawImage, ImageMeta]:
+    """One image and the rig's state; the time is read last, when nothing of this image remains to be done.
+
+    exposing: is called when everything is set and the exposure begins
+    """
     camera = rig.cameras[plan.camera_of(address.view)]
     angle = plan.angles_rad[plan.angle_of(address.view)]
     if address.kind == "silhouette":
         try:
             rig.floodlight.on()
+            exposing()
             raw = camera.expose()
         finally:
             rig.floodlight.off()
@@ -136,6 +196,7 @@ def _take(rig: Rig, plan: Plan, address: ImageAddress) -> tuple[RawImage, ImageM
     if address.laser == 0:
         rig.projector.move(aim.u, aim.v)
     with gate_open(rig.lasers[address.laser]):
+        exposing()
         raw = camera.expose()
         power = rig.photodiode.read()
     return raw, ImageMeta(rig.now(), power, angle, aim.u, aim.v)

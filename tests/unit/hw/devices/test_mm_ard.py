@@ -225,7 +225,7 @@ def test_silence_and_nonsense_end_in_one_line() -> None:
     bench = BoardBench()
     board = bench.connect()
     bench.line.answer_faults.extend([lost] * 10)
-    with pytest.raises(NoAnswer, match=r"mirror board did not answer 29 03 within 0\.2 s\. Remedy"):
+    with pytest.raises(NoAnswer, match=r"mirror board did not answer 29 03 29 03 29 03 within 0\.2 s\. Remedy"):
         board.counts(3)
     bench.line.answer_faults.clear()
     bench.line.answer_faults.extend([garbled(0)] * 10)

@@ -153,6 +153,9 @@ def test_what_the_laser_says_reaches_a_program_that_reads_slowly(laser: Laser, p
         ("7 (a) b) T 1", True),
         ("7 (a T b) S 1", False),
         ("7 (python) R 1", False),
+        ("7 (python) R 1 7 7 0 -1 4194560" + 21 * " 1" + " 0 0", False),
+        ("7 (python) R 1 7 7 0 -1 4194564" + 21 * " 1" + " 0 0", True),  # it is exiting
+        ("7 (python) R 1 7 7 0 -1 4194560" + 21 * " 1" + " 256 0", True),  # SIGKILL waits for it
     ],
 )
 def test_the_state_of_a_process_is_read_whatever_it_is_called(

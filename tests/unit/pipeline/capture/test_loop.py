@@ -374,3 +374,34 @@ def test_sigkill_at_200_moments_loses_nothing_that_was_reported(tmp_path: Path, 
     assert 0 < stored < len(LONG)
     assert capture(FakeRig(LONG), LONG, folder) == stored
     assert contents(folder) == contents(whole)
+
+
+def test_an_image_is_stored_while_the_next_one_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Encoding takes half a frame. Expected: what is stored late keeps no exposure waiting, and its order."""
+    append, begun = StreamWriter.append, [threading.Event() for _ in range(len(PLAN))]
+
+    def late(self: StreamWriter, address: ImageAddress, raw: RawImage, meta: ImageMeta) -> None:
+        assert begun[min(len(self) + 1, len(PLAN) - 1)].wait(5.0)
+        append(self, address, raw, meta)
+
+    monkeypatch.setattr(StreamWriter, "append", late)
+    monkeypatch.setattr("pipeline.capture.loop.SMALL", 0)
+    assert capture(FakeRig(PLAN, lambda rig: begun[rig.exposures].set()), PLAN, tmp_path) == 0
+    with StreamReader(tmp_path) as stream:
+        stream.require_complete()
+
+
+def test_large_images_are_stored_as_small_ones_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the background: reported in order when they are stored, all of them after Ctrl-C, and bit for bit the same."""
+    capture(FakeRig(PLAN), PLAN, tmp_path / "small")
+    monkeypatch.setattr("pipeline.capture.loop.SMALL", 0)
+    seen: list[int] = []
+
+    def interrupt(rig: FakeRig) -> None:
+        if rig.exposures == 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted, match="7 of 48"):
+        capture(FakeRig(PLAN, interrupt), PLAN, tmp_path / "large", lambda done, total: seen.append(done))
+    assert capture(FakeRig(PLAN), PLAN, tmp_path / "large", lambda done, total: seen.append(done)) == 7
+    assert seen == list(range(1, 49)) and contents(tmp_path / "large") == contents(tmp_path / "small")
