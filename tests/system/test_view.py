@@ -138,7 +138,7 @@ def test_what_hands_do_shows(opened: Any) -> None:
     opened.mouse.move(middle[0] + 40, middle[1] + 30)
     opened.mouse.up()
     opened.keyboard.up("Shift")
-    assert "moved" in opened.inner_text("#status")
+    opened.wait_for_function("document.querySelector('#status').textContent.includes('moved')")
     opened.keyboard.press("p")
     opened.mouse.click(*middle)
     assert np.abs(seen(opened) - before).mean() > 1
