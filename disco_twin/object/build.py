@@ -14,12 +14,12 @@ from disco_twin.object.bodies import OBJECT, Body, Named, OwnMedium, bodies_of, 
 from disco_twin.object.extrusion import extrusion
 from disco_twin.object.media import Medium, build_medium
 from disco_twin.object.mesh import hat_basis, read_mesh
-from disco_twin.object.remesh import remesh
 from disco_twin.object.scanner import scan_points
 from disco_twin.scene.object_schema import MOST_VERTICES
 from disco_twin.scene.shape_schema import Blend, Box, Extrusion, MeshFile, Pebble, Shape, Sphere, Torus
 from hw.base.errors import InputError
 from pipeline.geometry.mesh_file import require_size
+from pipeline.geometry.remesh import remesh
 from pipeline.geometry.surface_from_points import reconstruct_surface
 
 if TYPE_CHECKING:

@@ -7,10 +7,11 @@ import trimesh
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from disco_twin.object.mesh import closest, depth
+from disco_twin.object.mesh import depth
 from disco_twin.scene.object_schema import Crack, Feature, HollowCore, Layers, Patch, Veins
 from hw.base.arrays import F64, I64
 from hw.base.errors import InputError
+from pipeline.geometry.mesh import closest
 
 MOST_VEINS = 1e6
 

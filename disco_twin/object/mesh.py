@@ -8,11 +8,11 @@ import gpytoolbox
 import numpy as np
 import scipy.sparse
 import trimesh
-from numpy.typing import NDArray
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from hw.base.arrays import F64, I64
+from hw.base.arrays import F64
 from hw.base.errors import InputError
+from pipeline.geometry.mesh import arrays
 from pipeline.geometry.mesh_file import load_mesh, mending, require_closed, require_size
 
 KEY = "object.shape.file"
@@ -91,13 +91,6 @@ def crossing(mesh: trimesh.Trimesh) -> F64 | None:
     return np.asarray(point[found[0]]) if len(found) else None
 
 
-def closest(mesh: trimesh.Trimesh, points: F64) -> tuple[F64, I64]:
-    """(N, 3) closest points on the surface to (N, 3) points, and (N,) the triangles that they lie on."""
-    v, f = arrays(mesh)
-    _, triangle, weights = gpytoolbox.squared_distance(points, v, f, use_cpp=True)
-    return np.einsum("nk,nkd->nd", weights, v[f[triangle]]), triangle.astype(np.int64)
-
-
 def distance_to(mesh: trimesh.Trimesh, points: F64) -> F64:
     """(N,) unsigned distance to the surface of (N, 3) points."""
     v, f = arrays(mesh)
@@ -131,8 +124,3 @@ def hat_basis(fine: trimesh.Trimesh, scan: trimesh.Trimesh) -> scipy.sparse.csr_
         problem = f"{empty} vertices of the scan are not resolved by the object's mesh"
         raise InputError(problem, key="scan.vertices", remedy="lower scan.vertices, or give a finer mesh")
     return basis
-
-
-def arrays(mesh: trimesh.Trimesh) -> tuple[F64, NDArray[np.int32]]:
-    """Plain (V, 3) float64 and (F, 3) int32 arrays, as gpytoolbox's C++ asks for."""
-    return np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int32)

@@ -11,6 +11,7 @@ from functools import cached_property, lru_cache
 import gpytoolbox
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 from scipy import sparse
 
 from hw.base.arrays import F64, I64, Bool
@@ -216,3 +217,15 @@ def _ray_mesh(mesh: trimesh.Trimesh) -> RayMesh:
 def _dot(a: F64, b: F64) -> F64:
     """(N,) products of the rows of two (N, 3)."""
     return np.asarray(np.einsum("ni,ni->n", a, b))
+
+
+def closest(mesh: trimesh.Trimesh, points: F64) -> tuple[F64, I64]:
+    """(N, 3) closest points on the surface to (N, 3) points, and (N,) the triangles that they lie on."""
+    v, f = arrays(mesh)
+    _, triangle, weights = gpytoolbox.squared_distance(points, v, f, use_cpp=True)
+    return np.einsum("nk,nkd->nd", weights, v[f[triangle]]), triangle.astype(np.int64)
+
+
+def arrays(mesh: trimesh.Trimesh) -> tuple[F64, NDArray[np.int32]]:
+    """Plain (V, 3) float64 and (F, 3) int32 arrays, as gpytoolbox's C++ asks for."""
+    return np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int32)

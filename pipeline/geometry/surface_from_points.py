@@ -1,10 +1,14 @@
 """From a scanned point cloud to the mesh that everything else stands on (thesis 4.4, 5.3.1).
 
 Screened Poisson reconstruction (Kazhdan and Hoppe 2013), then remeshing to triangles of nearly equal area (Botsch and
-Kobbelt 2004): throughput factors are symmetric on those only.
+Kobbelt 2004): throughput factors are symmetric on those only. Both round edges, and triangles of a rounded edge zigzag
+about it: where the points show that, the surface is reconstructed more finely, its edges are held while it is remeshed,
+and the vertices are fitted to the points (docs/decisions/0126-edges-of-scanned-objects.md).
 """
 
 from __future__ import annotations
+
+import logging
 
 import gpytoolbox
 import numpy as np
@@ -13,10 +17,19 @@ from scipy.spatial import cKDTree
 
 from hw.base.arrays import F64
 from hw.base.errors import InputError
+from pipeline.geometry.mesh import arrays
+from pipeline.geometry.remesh import fitted, remesh
 
-PSR_DEPTH = 7  # cells of 1/128 of the object's extent
-SCREENING = 0.5  # weight of single points against smoothness: their noise is averaged
+log = logging.getLogger(__name__)
+
+PSR_DEPTH, SCREENING = 7, 0.5  # cells of 1/128 of the object's extent; weight of single points against smoothness
+FINE_DEPTH, FINE_SCREENING = 8, 2.0  # where there are edges
 LEAST_POINTS = 800
+STIFFNESS = 0.1  # as strong as a tenth of a vertex's points: a corner's own few leave some directions open
+OFF, MOST_OFF = (
+    3.0,
+    0.01,
+)  # deviations of noise, by which more than that share of the points misses a rounded mesh
 
 
 def reconstruct_surface(points: F64, normals: F64, vertices: int) -> trimesh.Trimesh:
@@ -27,17 +40,38 @@ def reconstruct_surface(points: F64, normals: F64, vertices: int) -> trimesh.Tri
     if len(points) < LEAST_POINTS:
         raise InputError("too few points", key="points", value=len(points), allowed=f"at least {LEAST_POINTS}",
                          remedy="scan more of the object")  # fmt: skip
+    rounded = _smooth(_enclosed(points, normals, PSR_DEPTH, SCREENING), points, vertices)
+    missed = _missed(rounded, points)
+    if missed <= MOST_OFF:
+        return rounded
+    try:
+        fine = remesh(_enclosed(points, normals, FINE_DEPTH, FINE_SCREENING), vertices)
+    except InputError:  # so few vertices do not resolve its edges
+        return rounded
+    edged = fitted(fine, points, np.ones(len(points)), STIFFNESS)
+    left = _missed(edged, points)
+    log.info("scan: %.1f %% of the points are off a rounded mesh, %.1f %% off one with edges", 100 * missed, 100 * left)
+    sound = edged.is_watertight and edged.is_winding_consistent and edged.volume > 0
+    return edged if sound and left < missed else rounded
+
+
+def _enclosed(points: F64, normals: F64, depth: int, screening: float) -> trimesh.Trimesh:
+    """The largest closed surface by screened Poisson reconstruction."""
     v, f = gpytoolbox.point_cloud_to_mesh(
-        points.astype(np.float64), normals.astype(np.float64), psr_screening_weight=SCREENING, psr_depth=PSR_DEPTH
+        points.astype(np.float64), normals.astype(np.float64), psr_screening_weight=screening, psr_depth=depth
     )
     whole = max(trimesh.Trimesh(v, f, process=True).split(only_watertight=True), key=lambda m: m.volume, default=None)
     if whole is None:
         raise InputError("the points enclose no surface", key="points", remedy="scan the missing sides")
+    return whole
+
+
+def _smooth(whole: trimesh.Trimesh, points: F64, vertices: int) -> trimesh.Trimesh:
+    """About so many vertices near a surface without edges."""
     edge = float(np.sqrt(whole.area / (2 * vertices) * 4 / np.sqrt(3)))
     mesh = whole
     for _ in range(6):
-        start = (np.array(whole.vertices, np.float64), np.array(whole.faces, np.int32))
-        mesh = trimesh.Trimesh(*gpytoolbox.remesh_botsch(*start, 20, edge, True), process=False)
+        mesh = trimesh.Trimesh(*gpytoolbox.remesh_botsch(*arrays(whole), 20, edge, True), process=False)
         if abs(len(mesh.vertices) / vertices - 1) < 0.01:
             break
         edge *= float(np.sqrt(len(mesh.vertices) / vertices))
@@ -55,7 +89,12 @@ def reconstruct_surface(points: F64, normals: F64, vertices: int) -> trimesh.Tri
     return mesh
 
 
+def _missed(mesh: trimesh.Trimesh, points: F64) -> float:
+    """Share of the points that are off the mesh by more than `OFF` deviations of what most of them are off by."""
+    distance = np.abs(_outside(mesh, points))
+    return float((distance > OFF * 1.4826 * np.median(distance)).mean())
+
+
 def _outside(mesh: trimesh.Trimesh, points: F64) -> F64:
     """(N,) signed distance of points from the mesh in mm, positive outside."""
-    v, f = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int32)
-    return np.asarray(gpytoolbox.signed_distance(points, v, f)[0], np.float64)
+    return np.asarray(gpytoolbox.signed_distance(points, *arrays(mesh))[0], np.float64)

@@ -8,9 +8,9 @@ import trimesh
 
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.object import shapes
-from disco_twin.object.remesh import remesh
 from disco_twin.scene.scene import Scene
 from disco_twin.scene.shape_schema import Sphere
+from pipeline.geometry.remesh import remesh
 
 VERTICES = 162  # of the scan
 

@@ -27,9 +27,9 @@ from disco_twin.experiment.experiment import Experiment
 from disco_twin.light.transport import Transport
 from disco_twin.light.truth import REPLICATES, Truth, standard_error, truth_columns
 from disco_twin.object.build import hat_basis
-from disco_twin.object.remesh import remesh
 from disco_twin.scene.scene import load_scene
 from pipeline.geometry.fresnel import Boundary
+from pipeline.geometry.remesh import remesh
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
 

@@ -10,10 +10,11 @@ import pytest
 import trimesh
 
 from disco_twin.object import shapes
-from disco_twin.object.mesh import closest, depth, hat_basis, read_mesh
-from disco_twin.object.remesh import remesh
+from disco_twin.object.mesh import depth, hat_basis, read_mesh
 from disco_twin.scene.shape_schema import Pebble, Sphere
 from hw.base.errors import InputError
+from pipeline.geometry.mesh import closest
+from pipeline.geometry.remesh import remesh
 
 PEBBLE = shapes.pebble(Pebble(kind="pebble"))
 

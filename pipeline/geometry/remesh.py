@@ -1,4 +1,4 @@
-"""The scan without a scanner's errors: few triangles of nearly equal area that keep an object's edges and its size.
+"""Few triangles of nearly equal area that keep a surface's edges and its size.
 
 Botsch and Kobbelt 2004 with sharp edges held, by gpytoolbox; then the best fit of the flat triangles to the surface.
 Measured in docs/decisions/0108-the-remeshed-scan.md.
@@ -12,9 +12,9 @@ import trimesh
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from disco_twin.object.mesh import arrays, closest
 from hw.base.arrays import F64, I64
 from hw.base.errors import InputError
+from pipeline.geometry.mesh import arrays, closest
 from pipeline.geometry.mesh_file import with_area
 
 SHARP = np.deg2rad(40.0)  # between the normals on both sides of an edge that stays one
@@ -177,19 +177,28 @@ def _of_its_size(coarse: trimesh.Trimesh, fine: trimesh.Trimesh) -> trimesh.Trim
     def off(of: trimesh.Trimesh) -> float:
         return float(of.area / fine.area + of.volume / fine.volume - 2)
 
-    fit = coarse
-    for _ in range(FITS):
-        fit = _fitted(fit, fine)
+    middles = np.asarray(fine.vertices)[fine.edges_unique].mean(axis=1)  # a rule of degree 2
+    areas = np.repeat(np.asarray(fine.area_faces) / 3.0, 3)
+    weight = np.asarray(np.bincount(fine.edges_unique_inverse, areas), np.float64)
+    fit = fitted(coarse, middles, weight)
     before, after = off(coarse), off(fit)  # nearly linear between
     share = float(np.clip(before / (before - after), 0.5, 1.0)) if abs(before - after) > 1e-9 else 1.0
     moved = coarse.vertices + share * (fit.vertices - coarse.vertices)
     return trimesh.Trimesh(moved, coarse.faces, process=False)
 
 
-def _fitted(coarse: trimesh.Trimesh, fine: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Vertices of `coarse` moved so that the squared distance of the surface of `fine` from it is least.
+def fitted(coarse: trimesh.Trimesh, points: F64, weight: F64, stiffness: float = 0.0) -> trimesh.Trimesh:
+    """Vertices of `coarse` moved so that the squared distance of (N, 3) points, (N,) weights, from it is least.
 
-    Distances are linear in the vertices' places once every point has its closest triangle. A vertex moves along the
+    stiffness: of what holds the vertices, as a share of what the points do on average; some where they are noisy
+    """
+    for _ in range(FITS):
+        coarse = _fitted(coarse, points, weight, stiffness)
+    return coarse
+
+
+def _fitted(coarse: trimesh.Trimesh, points: F64, weight: F64, stiffness: float) -> trimesh.Trimesh:
+    """Distances are linear in the vertices' places once every point has its closest triangle. A vertex moves along the
     normal where the triangles around it share one, across an edge in two directions, at a corner in all three. Then a
     shift along the normal everywhere changes the sum at no first order: the mean signed distance is 0.
     """
@@ -202,8 +211,6 @@ def _fitted(coarse: trimesh.Trimesh, fine: trimesh.Trimesh) -> trimesh.Trimesh:
     share, direction = np.linalg.eigh(spread)
     direction = direction * (share >= np.sin(0.5 * SHARP) ** 2)[:, None, :]  # (V, 3, 3), columns
 
-    points = np.asarray(fine.vertices)[fine.edges_unique].mean(axis=1)  # middles of edges: a rule of degree 2
-    weight = np.bincount(fine.edges_unique_inverse, np.repeat(np.asarray(fine.area_faces) / 3.0, 3))
     _, triangle, hat = gpytoolbox.squared_distance(points, vertices, faces, use_cpp=True)
     around, normal = faces[triangle], normals[triangle]
     distance = np.einsum("nd,nd->n", points - np.einsum("nk,nkd->nd", hat, vertices[around]), normal)
@@ -212,6 +219,8 @@ def _fitted(coarse: trimesh.Trimesh, fine: trimesh.Trimesh) -> trimesh.Trimesh:
     starts = 9 * np.arange(len(points) + 1)
     matrix = sparse.csr_array((moves.ravel(), columns.ravel(), starts), shape=(len(points), 3 * len(vertices)))
     square = (matrix.T @ (matrix * weight[:, None])).tocsc()
-    square += STIFFNESS * square.diagonal().max() * sparse.identity(square.shape[0], format="csc")
+    diagonal = square.diagonal()
+    held = STIFFNESS * diagonal.max() + stiffness * diagonal.mean()
+    square += held * sparse.identity(square.shape[0], format="csc")
     amount = sparse.linalg.spsolve(square, matrix.T @ (weight * distance)).reshape(-1, 3)
     return trimesh.Trimesh(vertices + np.einsum("vde,ve->vd", direction, amount), faces, process=False)

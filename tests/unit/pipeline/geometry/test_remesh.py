@@ -13,9 +13,9 @@ from mesh_writers import L, obj, prism
 
 from disco_twin.object import shapes
 from disco_twin.object.mesh import depth, read_mesh
-from disco_twin.object.remesh import remesh
 from disco_twin.scene.shape_schema import Box, Pebble, Sphere, Torus
 from hw.base.errors import InputError
+from pipeline.geometry.remesh import remesh
 
 PEBBLE = shapes.pebble(Pebble(kind="pebble"))
 CUBE = prism(np.array([[0, 0], [30, 0], [30, 30], [0, 30]], float), 30.0)
