@@ -77,6 +77,12 @@ def build_object(scene: Scene) -> TwinObject:
     outer, shells = mesh, list[Named]()
     if isinstance(scene.object.shape, MeshFile):
         outer, shells = shells_of(mesh, boundary.eta, boundary.alpha, "object.shape.file")
+    if shells and not rough:
+        raise InputError(
+            "the mesh file has shells inside others, whose walls refract light, and the object's own surface does not",
+            key="object.boundary.kind", value=surface.kind, allowed="rough",
+            remedy="take 'rough', or take the inner shells out of the file",
+        )  # fmt: skip
     first = OBJECT + 1 + len(shells)
     named = [*shells, *bodies_of(scene.object.inside, boundary.eta, len(wavelengths), _mesh, first)]
     check_nesting(outer, named)

@@ -67,13 +67,14 @@ class Supervisor:
             ready = set(select.select([self._lifeline.fileno(), *sources][self.cause is not None :], [], [], TICK_S)[0])
             if self.cause is None and (cause := self._ending(ready)):
                 self._make_all_dark(cause)
+                self._take_what_waits()
             for device in tuple(self._devices):
                 try:
                     confirmed = device.serve(ready)
                 except OSError as error:
                     log.info("%s: %s", device.url, error)
-                    confirmed = device.make_dark()
                     self._make_all_dark(f"the port {device.url} is gone: its cable was pulled, or it lost power")
+                    confirmed = device.make_dark() if device.dark is None else None
                 if confirmed is not None:
                     self._give_back(device, confirmed)
 
@@ -123,8 +124,24 @@ class Supervisor:
             with suppress(OSError):
                 device.host.shutdown(socket.SHUT_RDWR)  # the program sees its port vanish
 
+    def _take_what_waits(self) -> None:
+        """Ports that were asked for before the end and not opened yet: a supervisor in place of one that was killed may
+        find the program gone before it has read which devices are to be dark.
+        """
+        self._lifeline.setblocking(False)  # `recv_fds` leaves its flags out
+        with suppress(OSError):
+            while True:
+                data, files, _, _ = socket.recv_fds(self._lifeline, 4096, 16)
+                for file in files:
+                    self._lend(socket.socket(fileno=file))
+                if not data:
+                    break
+        for device in self._devices:
+            if device.dark is None:
+                device.make_dark()
+
     def _give_back(self, device: SupervisedDevice, confirmed: bool) -> None:
-        if not confirmed:
+        if not confirmed and self.cause is not None:  # else the others go on, and the log has said it
             self._tell(f"; {device.url}: {device.kind.warning}. {REMEDY}")
         device.close()
         device.host.close()  # what the program waits for when it closes its port

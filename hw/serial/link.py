@@ -17,6 +17,7 @@ import serial
 
 from hw.base.clock import Clock
 from hw.base.errors import DeviceError, Garbled, NoAnswer, SwitchedOff, Unplugged, WrongDevice
+from hw.safety.ports.protocol_supervised import REMEDY as AFTER_DARK
 from hw.safety.ports.protocol_supervised import GoneDark
 from hw.safety.supervised_device import FAILURES
 from hw.serial.bytelog import ByteLog
@@ -39,7 +40,10 @@ FORBIDDEN = (
     "permission denied",
     "join the group that owns the port (`sudo usermod -aG dialout $USER` in most cases, then log in again)",
 )
-IN_USE = ("another program uses it", "end that program (`fuser -v` and the port names it)")
+IN_USE = (
+    "another program uses it, or the supervisor of one that has ended is still making it dark",
+    "wait some seconds; if it stays so, turn the laser's key, then end that program (`fuser -v` and the port names it)",
+)
 NO_PORT = ("it is no serial port", f"name the device's port: {LISTED}")
 NOBODY = ("nobody answers there", "start the program that serves the port, or correct the port")
 TROUBLE = (
@@ -168,7 +172,7 @@ class Link:
             self._log.note(self.clock.now(), mark, data)
 
     def _lost(self, what: str, error: Exception, remedy: str = REMEDY) -> Unplugged:
-        kind = SwitchedOff if isinstance(error, GoneDark) else Unplugged
+        kind, remedy = (SwitchedOff, AFTER_DARK) if isinstance(error, GoneDark) else (Unplugged, remedy)
         lost = kind(self.url, f"the port of {self.device}", what, remedy)
         lost.known, self._gone = self._gone, True
         self._note("!", str(error).encode())

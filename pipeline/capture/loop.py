@@ -121,9 +121,13 @@ class Storing:
     def finish(self) -> None:
         """Wait until everything is stored, and report it. Raises: StorageError."""
         self.begin()
-        stored, self._stored = self._stored, None
-        if stored is not None:
-            stored.result()
+        if self._stored is not None:  # kept while it is waited for: Ctrl-C must not hide what becomes of it
+            try:
+                self._stored.result()
+            except DiscoError:
+                self._stored = None
+                raise
+            self._stored = None
             self._report()
 
     def _report(self) -> None:

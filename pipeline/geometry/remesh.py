@@ -124,6 +124,11 @@ def _closed(mesh: trimesh.Trimesh) -> bool:
     return bool(closed and areas.min() > LEAST_AREA * areas.mean())
 
 
+def is_sound(coarse: trimesh.Trimesh, fine: trimesh.Trimesh) -> bool:
+    """Closed, outward, without slivers, and nearly nowhere folded over the surface that it stands for."""
+    return _closed(coarse) and len(_folded(coarse, fine)[0]) <= MOST_FOLDED * len(coarse.faces)
+
+
 def _folded(coarse: trimesh.Trimesh, fine: trimesh.Trimesh) -> tuple[I64, F64]:
     """Triangles that face away from the surface below their middle, or nearly have no area; (F, 3) its normals."""
     below = np.asarray(fine.faces)[closest(fine, np.array(coarse.triangles_center))[1]]

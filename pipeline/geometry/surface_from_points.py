@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from hw.base.arrays import F64
 from hw.base.errors import InputError
 from pipeline.geometry.mesh import arrays
-from pipeline.geometry.remesh import fitted, remesh
+from pipeline.geometry.remesh import fitted, is_sound, remesh
 
 log = logging.getLogger(__name__)
 
@@ -26,10 +26,7 @@ PSR_DEPTH, SCREENING = 7, 0.5  # cells of 1/128 of the object's extent; weight o
 FINE_DEPTH, FINE_SCREENING = 8, 2.0  # where there are edges
 LEAST_POINTS = 800
 STIFFNESS = 0.1  # as strong as a tenth of a vertex's points: a corner's own few leave some directions open
-OFF, MOST_OFF = (
-    3.0,
-    0.01,
-)  # deviations of noise, by which more than that share of the points misses a rounded mesh
+OFF, MOST_OFF = 3.0, 0.01  # deviations of their noise; share of the points that may be off a rounded mesh by more
 
 
 def reconstruct_surface(points: F64, normals: F64, vertices: int) -> trimesh.Trimesh:
@@ -41,18 +38,20 @@ def reconstruct_surface(points: F64, normals: F64, vertices: int) -> trimesh.Tri
         raise InputError("too few points", key="points", value=len(points), allowed=f"at least {LEAST_POINTS}",
                          remedy="scan more of the object")  # fmt: skip
     rounded = _smooth(_enclosed(points, normals, PSR_DEPTH, SCREENING), points, vertices)
-    missed = _missed(rounded, points)
+    off = np.abs(_outside(rounded, points))
+    limit = OFF * 1.4826 * float(np.median(off))  # of normal noise
+    missed = float((off > limit).mean())
     if missed <= MOST_OFF:
         return rounded
+    fine = _enclosed(points, normals, FINE_DEPTH, FINE_SCREENING)
     try:
-        fine = remesh(_enclosed(points, normals, FINE_DEPTH, FINE_SCREENING), vertices)
-    except InputError:  # so few vertices do not resolve its edges
+        edged = fitted(remesh(fine, vertices), points, np.ones(len(points)), STIFFNESS)
+    except InputError as error:
+        log.warning("the scan's edges are rounded: %s", error)
         return rounded
-    edged = fitted(fine, points, np.ones(len(points)), STIFFNESS)
-    left = _missed(edged, points)
+    left = float((np.abs(_outside(edged, points)) > limit).mean())
     log.info("scan: %.1f %% of the points are off a rounded mesh, %.1f %% off one with edges", 100 * missed, 100 * left)
-    sound = edged.is_watertight and edged.is_winding_consistent and edged.volume > 0
-    return edged if sound and left < missed else rounded
+    return edged if left < missed and is_sound(edged, fine) else rounded
 
 
 def _enclosed(points: F64, normals: F64, depth: int, screening: float) -> trimesh.Trimesh:
@@ -87,12 +86,6 @@ def _smooth(whole: trimesh.Trimesh, points: F64, vertices: int) -> trimesh.Trime
         pushed = mesh.vertices + mean[:, None] * mesh.vertex_normals
         mesh = trimesh.Trimesh(pushed, mesh.faces, process=False)
     return mesh
-
-
-def _missed(mesh: trimesh.Trimesh, points: F64) -> float:
-    """Share of the points that are off the mesh by more than `OFF` deviations of what most of them are off by."""
-    distance = np.abs(_outside(mesh, points))
-    return float((distance > OFF * 1.4826 * np.median(distance)).mean())
 
 
 def _outside(mesh: trimesh.Trimesh, points: F64) -> F64:

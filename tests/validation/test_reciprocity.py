@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 from scipy import stats
-from significance import assert_z
+from significance import assert_z, z_of_replicates
 from twins import twin
 
 from disco_twin.light.transport import Transport
@@ -81,8 +81,9 @@ def test_a_white_object_gives_back_all_that_enters(kind: str, eta: float) -> Non
     scan = trimesh.creation.icosphere(subdivisions=1, radius=3.0)
     fine = trimesh.creation.icosphere(subdivisions=3, radius=3.0)
     transport = Transport(twin(fine, kind, eta, 1.5, [1.0]), cells=64)  # type: ignore[arg-type]
-    truth = truth_columns(transport, hat_basis(fine, scan), np.array([0, 7, 20]), 100_000, 3)
-    total = truth.replicates[:, 0] @ truth.area
-    assert (total.std(axis=0) < 0.01 * total.mean(axis=0)).all()
-    off = total.mean(axis=0) - mean_transmittance(eta)
-    assert (np.abs(off) < 1e-3).all()  # the escaped power itself does not vary: photons are never absorbed
+    basis, columns = hat_basis(fine, scan), np.array([0, 7, 20])
+    runs = [truth_columns(transport, basis, columns, 50_000, seed) for seed in (3, 4)]
+    total = np.concatenate([run.replicates[:, 0] @ run.area for run in runs])
+    # No photon is absorbed: what varies is how many of a split photon's copies leave inside a replicate.
+    assert (total.std(axis=0, ddof=1) < 0.01 * total.mean(axis=0)).all()
+    assert_z(z_of_replicates(total, mean_transmittance(eta)), f"all that enters, {kind}, {eta}")

@@ -23,6 +23,7 @@ from serial import PortNotOpenError, SerialBase, SerialException, SerialTimeoutE
 
 from hw.base.children import child_environment, module_command
 from hw.base.errors import SwitchedOff
+from hw.safety.darkness import KINDS
 from hw.safety.signals import ENDING
 from hw.safety.supervisor import BEAT, LEND, READY, stopped
 
@@ -108,7 +109,7 @@ class Lifeline:
                     log.warning("the supervisor was killed or stopped: making everything dark")
                     _, ours, theirs = self._start()
                     with ours, theirs:  # it opens the ports, finds that nobody uses them, and insists
-                        for request in self.lent.values():
+                        for request in list(self.lent.values()):
                             self._ask(ours, request.replace(" 0 ", " 1 ", 1)).close()
             return self._why or None
 
@@ -154,6 +155,8 @@ class SupervisedPort(SerialBase):
     def open(self) -> None:
         """Have it opened: its device is told to be dark by that."""
         kind = str(self.port).removeprefix(PREFIX).partition(":")[0]
+        if kind not in KINDS:
+            raise SerialException(f"{kind!r} is no kind of device that is supervised: {', '.join(KINDS)}")
         request, end = f"{kind} {self.baudrate} 0 {port_of(str(self.port))}", time.monotonic() + IN_USE_S
         while True:
             host = LIFELINE.lend(request)

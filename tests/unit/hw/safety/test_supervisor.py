@@ -17,8 +17,10 @@ from capture_fakes import fork
 from supervisor_fakes import LIMIT_S, Laser, Opening, Run, said_by, supervisors_of, wait
 
 from hw.base.errors import SwitchedOff
+from hw.safety.darkness import KINDS
 from hw.safety.ports.protocol_supervised import LIFELINE, GoneDark, Lifeline, SupervisedPort, require_supervisor
 from hw.safety.signals import ENDING
+from hw.safety.supervisor import LEND, Supervisor
 from hw.serial.link import Link
 
 
@@ -170,6 +172,12 @@ def test_a_port_that_does_not_exist_is_an_error_of_opening() -> None:
         SupervisedPort("supervised://laser:/dev/disco-no-such-port", baudrate=500000, timeout=0.5)
 
 
+def read_all(port: SupervisedPort) -> None:
+    """What a laser had said before its port died can still be read."""
+    while port.read(64):
+        pass
+
+
 def test_a_dead_port_says_so(laser: Laser, ports: Opening) -> None:
     port = ports(laser)
     LIFELINE._supervisors[-1].terminate()
@@ -177,7 +185,7 @@ def test_a_dead_port_says_so(laser: Laser, ports: Opening) -> None:
     with pytest.raises(GoneDark, match="was told to end"):
         port.write(b"?GAS\r")
     with pytest.raises(GoneDark, match="was told to end"):
-        port.read(1)
+        read_all(port)
 
 
 def test_a_stop_or_kill_of_the_whole_foreground_group_does_not_reach_it(laser: Laser, run: Run) -> None:
@@ -208,6 +216,46 @@ def test_supervisor_and_program_killed_together_leave_it_on_until_the_next_conne
     assert laser.on
     ports(laser)
     wait(laser, on=False)
+
+
+def test_what_was_asked_for_before_the_program_was_gone_is_made_dark(lasers: Callable[..., Laser]) -> None:
+    """A supervisor in place of one that was killed may find the program gone before it has read what is to be dark."""
+    two = [lasers(on=True) for _ in range(2)]
+    program, lifeline = socket.socketpair()
+    with program, lifeline:
+        for laser in two:
+            ours, theirs = socket.socketpair()
+            with ours, theirs:
+                ours.send(f"laser 500000 1 {laser.port}".encode())
+                socket.send_fds(program, [LEND], [theirs.fileno()])
+        Supervisor(lifeline, program=os.getpid()).run()  # not the parent of this process
+    assert not any(laser.on for laser in two)
+
+
+def test_one_that_does_not_confirm_is_no_end_of_the_others() -> None:
+    """What comes over the lifeline says that everything is dark: a port that was closed alone is not told there."""
+    program, lifeline = socket.socketpair()
+    with program, lifeline:
+        supervisor = Supervisor(lifeline, program=os.getppid())
+        mute = Mute()
+        supervisor._devices.append(mute)  # type: ignore[arg-type]
+        supervisor._give_back(mute, confirmed=False)  # type: ignore[arg-type]
+        program.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            program.recv(1)
+
+
+class Mute:
+    """A device that was closed alone and does not confirm."""
+
+    url, kind = "socket://nobody", KINDS["laser"]
+
+    def __init__(self) -> None:
+        self.host, other = socket.socketpair()
+        other.close()
+
+    def close(self) -> None:
+        """Nothing to give back."""
 
 
 @pytest.mark.timing
