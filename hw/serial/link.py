@@ -41,8 +41,8 @@ FORBIDDEN = (
     "join the group that owns the port (`sudo usermod -aG dialout $USER` in most cases, then log in again)",
 )
 IN_USE = (
-    "another program uses it, or the supervisor of one that has ended is still making it dark",
-    "wait some seconds; if it stays so, turn the laser's key, then end that program (`fuser -v` and the port names it)",
+    "another program uses it",
+    "end that program (`fuser -v` and the port names it), but no supervisor: it makes the device dark, then ends",
 )
 NO_PORT = ("it is no serial port", f"name the device's port: {LISTED}")
 NOBODY = ("nobody answers there", "start the program that serves the port, or correct the port")
