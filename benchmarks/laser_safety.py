@@ -9,8 +9,11 @@ processes (keys with `busy_`).
 
 `worst_off_ms` counts from the event to darkness. It is the sum of ours, until the last command for darkness has left
 the supervisor (`worst_told_ms`), and of the emulated devices' own time from then on (`worst_emulator_ms`), which real
-devices spend in their firmware. `missed`: the light did not go out; `not_reached`: the program never got as far as the
-event. Waits that have nothing to do with it (emission, the board's boot, turns) are shortened.
+devices spend in their firmware. `missed`: the program got as far as the event, and the light did not go out;
+`not_reached`: it had ended before, or had not come so far in time. `notes` says of each of them what was lit, and what
+the program said last. Every trial begins with dark devices. The emulated ones run before ordinary processes, where
+the system allows it (`devices_first`): a laser's firmware does not wait for this computer's processors. Waits that have
+nothing to do with it (emission, the board's boot, turns) are shortened.
 """
 
 from __future__ import annotations
@@ -27,7 +30,8 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
+from multiprocessing import forkserver
+from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -65,6 +69,7 @@ GIVEN_UP_S = 3.0
 START_S = 60.0
 CLOSING_S = 0.1  # within it comes the signal after a normal end
 MUTE = 1  # the laser that falls silent
+DEVICES = 5  # real-time priority of the emulated devices
 SIGNALS = {
     "mute": signal.SIGINT,
     **{n: signal.Signals[n] for n in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGKILL", "SIGSTOP")},
@@ -99,25 +104,25 @@ class Blink:
         return RawImage(np.zeros((16, 16), np.uint8), np.zeros((16, 16), np.uint16))
 
 
-def _prepare(stamps: Path) -> None:
+def _prepare(out: Path) -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
-    sys.stderr = open(os.devnull, "w")  # noqa: SIM115 - its tracebacks are expected
+    os.dup2(os.open(out.with_suffix(".err"), os.O_CREAT | os.O_WRONLY | os.O_APPEND), 2)  # its supervisor's, too
     board_driver.BOOT_S = 0.05
-    os.environ[STAMPS] = str(stamps)
+    os.environ[STAMPS] = str(out.with_suffix(".stamps"))
     protocol_supervised.MODULE = "benchmarks.timed_supervisor"
 
 
 def program(rig_toml: Path, folder: Path, how: str, images: int, told: Connection) -> None:
     """A capture; says when it is under way (or, if it ends itself, when it does)."""
-    _prepare(folder.with_suffix(".stamps"))
+    _prepare(folder)
     rig = SerialRig(Connector(load_rig_file(rig_toml)), [Blink(how, images, told)], armed=True)
     capture(rig, PLAN, folder)
 
 
-def connecting(url: str, stamps: Path, told: Connection) -> None:
+def connecting(url: str, out: Path, told: Connection) -> None:
     """Opens a laser's port, and does nothing else."""
-    _prepare(stamps)
+    _prepare(out)
     link = Link(f"supervised://laser:{url}", 500000, "laser", WallClock())
     told.send(time.monotonic())
     link.close()
@@ -156,7 +161,8 @@ class Watch:
 class Trial:
     """off_ms: from the event to darkness, told_ms: to the last command for it; infinite if it did not come.
 
-    reached: the program got as far as the event. ended_s: from the event to the end of the program
+    reached: the program got as far as the event. ended_s: from the event to the end of the program. note: of one that
+    did not reach it or did not go dark
     """
 
     event: str
@@ -164,14 +170,17 @@ class Trial:
     off_ms: float = np.inf
     told_ms: float = np.inf
     ended_s: float = np.inf
+    note: str = ""
 
 
-def watched(numbers: Sequence[int]) -> tuple[list[Trial], list[str]]:
-    """The trials of one lane, one after the other, and what their bench saw that must never happen."""
+def watched(numbers: Sequence[int]) -> tuple[list[Trial], list[str], bool]:
+    """The trials of one lane, one after the other, what their bench saw that must never happen, `devices_first`."""
     omicron_firmware.EMISSION_S, turning.SPEED_DEG_S = 0.05, 720.0
-    emulation = emulated_devices(RIG, seed=1)
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])
+    forkserver.ensure_running()  # of the programs, at ordinary priority
+    first = _come_first()
+    emulation = emulated_devices(RIG, seed=1)
     trials = []
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
@@ -186,7 +195,7 @@ def watched(numbers: Sequence[int]) -> tuple[list[Trial], list[str]]:
             if EVENTS[number % len(EVENTS)] == "connect":
                 with Server(lasers, None) as sockets:
                     trials.append(_connected(context, emulation, sockets.urls, folder, number))
-    return trials, emulation.bench.hazards
+    return trials, emulation.bench.hazards, first
 
 
 def _captured(context: Any, emulation: Emulation, folder: Path, event: str, number: int) -> Trial:
@@ -197,17 +206,19 @@ def _captured(context: Any, emulation: Emulation, folder: Path, event: str, numb
     firmware = emulation.cables[f"laser{MUTE}"].firmware
     hear = firmware.feed
     ours, theirs = context.Pipe()
+    _darken(emulation)
     watch = Watch(emulation, mute)
     child = context.Process(target=program, args=(folder / "rig.toml", out, event, images, theirs))
     child.start()
     try:
-        if not ours.poll(START_S):
-            return Trial(event, reached=False)
+        wait([ours, child.sentinel], START_S)
+        if not ours.poll():
+            return Trial(event, reached=False, note=_note(watch, out, child))
         happened = float(ours.recv())
         if event in SIGNALS:
             time.sleep(float(random.uniform(0, 0.3)))
             if not watch.on:
-                return Trial(event, reached=False)
+                return Trial(event, reached=False, note=_note(watch, out, child))
             if mute is not None:
                 setattr(firmware, "feed", lambda data, now: [])  # noqa: B010 - one laser falls silent
             happened = time.monotonic()
@@ -221,7 +232,7 @@ def _captured(context: Any, emulation: Emulation, folder: Path, event: str, numb
             child.join(10.0)
             ended_s = time.monotonic() - happened
         told_ms = _told(out.with_suffix(".stamps"), happened, None if mute is None else f"laser{mute}")
-        return Trial(event, True, off_ms, told_ms, ended_s)
+        return Trial(event, True, off_ms, told_ms, ended_s, "" if np.isfinite(off_ms) else _note(watch, out, child))
     finally:
         setattr(firmware, "feed", hear)  # noqa: B010
         _end(child)
@@ -239,21 +250,50 @@ def _connected(context: Any, emulation: Emulation, urls: dict[str, str], folder:
         opened.append(time.monotonic())
         before()
 
+    _darken(emulation)
     head.on_since, head.level, head.mode = time.monotonic() - 60, 1.0, int(Mode.BIAS | Mode.RELEASE)
     setattr(line, "opened", spy)  # noqa: B010 - a spy on one line
     ours, theirs = context.Pipe()
-    watch, stamps = Watch(emulation, None), folder / f"connect{number}.stamps"
-    child = context.Process(target=connecting, args=(urls[name], stamps, theirs))
+    watch, out = Watch(emulation, None), folder / f"connect{number}"
+    child = context.Process(target=connecting, args=(urls[name], out, theirs))
     child.start()
     try:
-        if not ours.poll(START_S) or not opened:
-            return Trial("connect", reached=False)
-        return Trial("connect", True, _until_dark(watch, opened[0]), max(0.0, _told(stamps, opened[0] - 1.0) - 1e3))
+        wait([ours, child.sentinel], START_S)
+        if not ours.poll() or not opened:
+            return Trial("connect", reached=False, note=_note(watch, out, child))
+        off_ms = _until_dark(watch, opened[0])
+        told_ms = max(0.0, _told(out.with_suffix(".stamps"), opened[0] - 1.0) - 1e3)
+        return Trial("connect", True, off_ms, told_ms, note="" if np.isfinite(off_ms) else _note(watch, out, child))
     finally:
         setattr(line, "opened", before)  # noqa: B010
         child.join(10.0)  # it closes the port
         _end(child)
         watch.close()
+
+
+def _come_first() -> bool:
+    """Before all ordinary processes, after the supervisors; whether the system allows it."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(DEVICES))
+    except (OSError, AttributeError):
+        return False
+    return True
+
+
+def _darken(emulation: Emulation) -> None:
+    """What an earlier trial left lit is no matter of the next one's."""
+    emulation.bench.board.set_pattern(0)
+    for head in emulation.bench.heads:
+        head.on_since = None
+
+
+def _note(watch: Watch, out: Path, child: BaseProcess) -> str:
+    """What is lit, how the program is, and what it or its supervisor said last."""
+    bench, now = watch.emulation.bench, time.monotonic()
+    lit = [f"laser{k}" for k, head in enumerate(bench.heads) if head.on_since is not None]
+    said = out.with_suffix(".err").read_text(errors="replace").splitlines() if out.with_suffix(".err").exists() else []
+    state = "runs" if child.is_alive() else f"ended with {child.exitcode}"
+    return f"lit: {lit}, lines {bench.board.lines:#b}, {now - watch.last_on:.1f} s ago; {state}; said {said[-2:]}"
 
 
 def _told(stamps: Path, happened: float, but: str | None = None) -> float:
@@ -311,7 +351,7 @@ def figures(count: int, others: int) -> dict[str, Any]:
     load = os.getloadavg()[0]
     with busy(others), ProcessPoolExecutor(LANES, mp_context=multiprocessing.get_context("spawn")) as pool:
         seen = list(pool.map(watched, lanes))
-    trials = [trial for lane, _ in seen for trial in lane]
+    trials = [trial for lane, _, _ in seen for trial in lane]
     dark = [trial for trial in trials if np.isfinite(trial.off_ms)]
     rows = []
     for event in EVENTS:
@@ -334,10 +374,12 @@ def figures(count: int, others: int) -> dict[str, Any]:
         "worst_emulator_ms": max((max(0.0, t.off_ms - t.told_ms) for t in dark), default=0.0),
         "missed": sum(t.reached and not np.isfinite(t.off_ms) for t in trials),
         "not_reached": sum(not t.reached for t in trials),
+        "notes": [f"{t.event}: {'missed' if t.reached else 'not reached'}: {t.note}" for t in trials if t.note],
         "over_limit": sum(t.off_ms > 1e3 * LIMIT_S for t in dark),
         "ctrl_c_end_s": max((t.ended_s for t in dark if t.event in ("SIGINT", "mute")), default=0.0),
         "load_before": load,
-        "hazards": [hazard for _, found in seen for hazard in found],
+        "hazards": [hazard for _, found, _ in seen for hazard in found],
+        "devices_first": all(first for _, _, first in seen),
         "rows": rows,
     }
 

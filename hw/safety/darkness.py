@@ -47,6 +47,8 @@ def _omicron(letters: bytes) -> Answer:
 def _laser(ask: Ask) -> Confirmed:
     """LOf is confirmed, and the status says that the laser neither emits nor is about to."""
     done = yield from ask(LASER.off, _omicron(b"LOf"))
+    if done is None:
+        return False  # told again at once
     yield from ask(b"?TPP0.00000\r", _omicron(b"TPP"))  # no power and no autostart: it stays off
     yield from ask(b"?SAS0\r", _omicron(b"SAS"))
     status = yield from ask(b"?GAS\r", _omicron(rb"GAS(?=[0-9A-Fa-f]{1,4}\r)"))

@@ -17,19 +17,20 @@ import os
 import select
 import signal
 import socket
+import stat
 import sys
 import time
 from contextlib import suppress
 from pathlib import Path
 
 from hw.safety.darkness import KINDS, Ready
+from hw.safety.device_port import FAILURES
 from hw.safety.signals import ENDING
-from hw.safety.supervised_device import FAILURES, REMEDY, SupervisedDevice
+from hw.safety.supervised_device import REMEDY, SupervisedDevice
 
 log = logging.getLogger("supervisor")
 
 BEAT, LEND = b"\x00", b"\xff"  # on the lifeline, beside the numbers of the program's signals: every message is one byte
-READY = b"\x06"
 TICK_S = 0.01  # how often the program is looked after
 SILENCE_S = 3.0  # without a beat; beats come every 0.1 s, and a renderer in the program may hold them up for 1 s
 REALTIME = 10  # a priority above all ordinary processes
@@ -71,10 +72,10 @@ class Supervisor:
             for device in tuple(self._devices):
                 try:
                     confirmed = device.serve(ready)
-                except OSError as error:
+                except FAILURES as error:
                     log.info("%s: %s", device.url, error)
                     self._make_all_dark(f"the port {device.url} is gone: its cable was pulled, or it lost power")
-                    confirmed = device.make_dark() if device.dark is None else None
+                    confirmed = None
                 if confirmed is not None:
                     self._give_back(device, confirmed)
 
@@ -102,13 +103,9 @@ class Supervisor:
     def _lend(self, host: socket.socket) -> None:
         """Open the port that the first message on its socket names."""
         try:
-            device, said = SupervisedDevice(host, host.recv(4096)), READY
-            self._devices.append(device)
-        except FAILURES as error:
-            device, said = None, str(error).encode()[:200]
-        with suppress(OSError):  # the program has closed it again, which `serve` finds
-            host.send(said)
-        if device is None:
+            self._devices.append(SupervisedDevice(host))
+        except (OSError, KeyError, ValueError) as error:
+            log.info("%s", error)
             host.close()
 
     def _make_all_dark(self, cause: str) -> None:
@@ -117,8 +114,7 @@ class Supervisor:
             return
         self.cause = cause
         for device in sorted(self._devices, key=lambda device: list(KINDS.values()).index(device.kind)):
-            if device.dark is None:
-                device.make_dark()
+            device.make_dark()
         self._tell(cause)
         for device in self._devices:
             with suppress(OSError):
@@ -137,8 +133,7 @@ class Supervisor:
                 if not data:
                     break
         for device in self._devices:
-            if device.dark is None:
-                device.make_dark()
+            device.make_dark()
 
     def _give_back(self, device: SupervisedDevice, confirmed: bool) -> None:
         if not confirmed and self.cause is not None:  # else the others go on, and the log has said it
@@ -165,11 +160,30 @@ def come_first() -> list[str]:
     return refused
 
 
+class Terminal(logging.Handler):
+    """Says to standard error what it takes at once: one that is stopped (Ctrl-S) holds nothing up.
+
+    It is opened anew, since the program has the other description of it, and is to go on waiting for it. A file, which
+    never holds anything up, is not: its words would be written over the program's.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._file = 2
+        with suppress(OSError):  # no Linux, a socket, or closed
+            if not stat.S_ISREG(os.fstat(2).st_mode):
+                self._file = os.open("/proc/self/fd/2", os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """What it does not take is lost."""
+        with suppress(OSError):
+            if select.select([], [self._file], [], 0.0)[1]:
+                os.write(self._file, f"{self.format(record)}\n".encode())
+
+
 def main() -> None:
     """`python -m hw.safety.supervisor LIFELINE PROGRAM`: a socket's descriptor, and the program's process id."""
-    to_terminal = logging.StreamHandler()
-    to_terminal.addFilter(lambda record: bool(select.select([], [2], [], 0.0)[1]))  # one that takes nothing (Ctrl-S)
-    logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s", handlers=[to_terminal])
+    logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s", handlers=[Terminal()])
     gc.disable()  # nothing here makes circles
     refused = come_first()
     if refused:

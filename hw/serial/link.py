@@ -17,9 +17,9 @@ import serial
 
 from hw.base.clock import Clock
 from hw.base.errors import DeviceError, Garbled, NoAnswer, SwitchedOff, Unplugged, WrongDevice
+from hw.safety.device_port import FAILURES
 from hw.safety.ports.protocol_supervised import REMEDY as AFTER_DARK
 from hw.safety.ports.protocol_supervised import GoneDark
-from hw.safety.supervised_device import FAILURES
 from hw.serial.bytelog import ByteLog
 
 log = logging.getLogger(__name__)

@@ -7,18 +7,21 @@ import pty
 import re
 import select
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 
 import pytest
 
 from hw.base.clock import WallClock
 from hw.safety.ports.protocol_supervised import LIFELINE, SupervisedPort
+from hw.safety.supervised_device import READY
+from hw.safety.supervisor import LEND, Supervisor
 from hw.serial.link import Link
 
 LIMIT_S = 1.0  # on a busy machine; the benchmark measures the 100 ms
@@ -29,6 +32,7 @@ class Laser:
 
     def __init__(self, on: bool = False, deaf: int = 0) -> None:
         self.on, self.deaf, self.went_off = on, deaf, 0.0
+        self.late_s = 0.0  # before every answer
         self.preheats = self.refusals = 0  # questions answered so, and LOf that are refused
         self.said: list[str] = []
         self.master, self._keep = pty.openpty()  # the slave stays open, or a reconnecting program meets an error
@@ -69,6 +73,7 @@ class Laser:
         self.preheats -= preheats
         status = f"{0x200 | 4 * preheats | 2 * self.on:04X}"
         answer = status if letters == "GAS" else ">"
+        time.sleep(self.late_s)
         for piece in (f"\0!{letters[:2]}$note\r\0{letters[2:]}", f"{answer}\r"):  # as broken as it may be
             os.write(self.master, piece.encode())
             time.sleep(0.005)
@@ -202,6 +207,23 @@ def link(laser: Laser) -> Iterator[Link]:
     made = Link("supervised://laser:" + laser.port, 500000, "laser 635 nm", WallClock())
     yield made
     made.close()
+
+
+@contextmanager
+def serving(port: str) -> Iterator[tuple[socket.socket, socket.socket, threading.Thread]]:
+    """A supervisor in a thread: its lifeline, the socket of one port that is lent, and the thread."""
+    (ours, theirs), (host, lent) = socket.socketpair(), socket.socketpair()
+    thread = threading.Thread(target=Supervisor(theirs, os.getppid()).run)
+    with ours, theirs, host:
+        host.send(f"laser 500000 0 {port}".encode())
+        socket.send_fds(ours, [LEND], [lent.fileno()])
+        lent.close()
+        thread.start()
+        assert host.recv(1) == READY
+        yield ours, host, thread
+        ours.close()
+        thread.join(5.0)
+        assert not thread.is_alive()
 
 
 def supervisors_of(program: int) -> list[int]:

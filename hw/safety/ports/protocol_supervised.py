@@ -18,6 +18,7 @@ import termios
 import threading
 import time
 from contextlib import suppress
+from urllib.parse import urlsplit
 
 from serial import PortNotOpenError, SerialBase, SerialException, SerialTimeoutException
 
@@ -25,7 +26,8 @@ from hw.base.children import child_environment, module_command
 from hw.base.errors import SwitchedOff
 from hw.safety.darkness import KINDS
 from hw.safety.signals import ENDING
-from hw.safety.supervisor import BEAT, LEND, READY, stopped
+from hw.safety.supervised_device import READY
+from hw.safety.supervisor import BEAT, LEND, stopped
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +45,18 @@ def port_of(url: str) -> str:
     return url.removeprefix(PREFIX).partition(":")[2] if url.startswith(PREFIX) else url
 
 
+def _in_numbers(port: str) -> str:
+    """The address of a network port: the supervisor cannot wait for one that is a name. Raises: SerialException."""
+    if not port.startswith("socket://"):
+        return port
+    parts = urlsplit(port)
+    try:
+        address = socket.getaddrinfo(parts.hostname, parts.port, type=socket.SOCK_STREAM)[0][4][0]
+    except OSError as error:
+        raise SerialException(f"{parts.hostname}: {error.strerror}") from error
+    return f"socket://[{address}]:{parts.port}" if ":" in str(address) else f"socket://{address}:{parts.port}"
+
+
 class GoneDark(SerialException):
     """The supervisor has made the device dark, or is about to, and its port is dead; the text says why."""
 
@@ -55,12 +69,26 @@ class Lifeline:
     """
 
     def __init__(self) -> None:
+        self._begin()
+        os.register_at_fork(after_in_child=self._leave)
+
+    def _begin(self) -> None:
         self._ours, self._theirs = socket.socketpair()
         self._supervisors: list[subprocess.Popen[bytes]] = []  # the last one is in charge; others still insist
         self._why = ""  # everything is dark
-        self._lock = threading.RLock()
+        self._lock = threading.RLock()  # of all that is here
         self.lent: dict[SupervisedPort, str] = {}  # the ports that are open, and the requests for them
-        os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))  # a child's signals are not the program's
+
+    def _leave(self) -> None:
+        """In a child that was forked: signals, supervisor and ports are its parent's, and it closes none of them."""
+        signal.set_wakeup_fd(-1)
+        for port in self.lent:
+            port.leave()
+        for supervisor in self._supervisors:
+            supervisor.returncode = 0  # no child of this process, which is not to wait for it
+        for end in (self._ours, self._theirs):
+            end.close()
+        self._begin()
 
     def lend(self, request: str) -> socket.socket:
         """Ask for a port. What comes from the socket first is READY, or why the port cannot be opened."""
@@ -135,7 +163,13 @@ class Lifeline:
         if why is not None:
             with suppress(subprocess.TimeoutExpired):
                 self._supervisors[-1].wait(max(0.0, end - time.monotonic()))
-        self.lent.pop(port, None)
+        with self._lock:
+            self.lent.pop(port, None)
+
+    def keep(self, port: SupervisedPort, request: str) -> None:
+        """A port is open: the supervisor after one that was killed is to make its device dark."""
+        with self._lock:
+            self.lent[port] = request
 
 
 LIFELINE = Lifeline()
@@ -157,7 +191,7 @@ class SupervisedPort(SerialBase):
         kind = str(self.port).removeprefix(PREFIX).partition(":")[0]
         if kind not in KINDS:
             raise SerialException(f"{kind!r} is no kind of device that is supervised: {', '.join(KINDS)}")
-        request, end = f"{kind} {self.baudrate} 0 {port_of(str(self.port))}", time.monotonic() + IN_USE_S
+        request, end = f"{kind} {self.baudrate} 0 {_in_numbers(port_of(str(self.port)))}", time.monotonic() + IN_USE_S
         while True:
             host = LIFELINE.lend(request)
             try:
@@ -175,13 +209,19 @@ class SupervisedPort(SerialBase):
                 raise SerialException(said.decode(errors="replace") or "the supervisor did not start")
             time.sleep(BEAT_S)
         self._host, self.is_open = host, True
-        LIFELINE.lent[self] = request
+        LIFELINE.keep(self, request)
 
     def close(self) -> None:
         """Make the device dark and give the port back; a second time does nothing."""
         if self._host is not None:
             host, self._host, self.is_open = self._host, None, False
             LIFELINE.give_back(self, host)
+
+    def leave(self) -> None:
+        """Forget the port, which is another process's, without closing it for that one."""
+        if self._host is not None:
+            self._host.close()
+        self._host, self.is_open = None, False
 
     def _open_host(self) -> socket.socket:
         if self._host is None:

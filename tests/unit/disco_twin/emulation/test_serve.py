@@ -15,7 +15,7 @@ import pytest
 import serial
 from capture_fakes import contents
 from replay import ReplayPeer, read_log
-from serial_fakes import ScaledClock
+from serial_fakes import PatientClock, ScaledClock
 from twin_fakes import PLAN, RIG, Glow
 
 from disco_twin.emulation.emulated_rig import Emulation
@@ -135,9 +135,9 @@ def test_unplug_and_replug(served: tuple[Desk, Server]) -> None:
 
 
 def test_a_capture_through_terminals_equals_the_direct_twin(tmp_path: Path) -> None:
-    """In real time, only faster: also where bytes come when they come."""
+    """Bytes come when they come; nobody waits for turns and exposures."""
     capture(TwinRig(RIG, Glow(), seed=5), PLAN, tmp_path / "direct")
-    emulated = Emulation(TwinRig(RIG, Glow(), seed=5), ScaledClock())
+    emulated = Emulation(TwinRig(RIG, Glow(), seed=5), PatientClock())
     ports = tmp_path / "ports"
     ports.mkdir()
     with Server(emulated.cables, ports) as server:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from capture_fakes import contents
 from rig_files import CAMERAS
+from serial_fakes import PatientClock
 from twin_fakes import PLAN, RIG, Glow
 
 from disco_twin.camera.lars3 import lars3_sensor
@@ -233,9 +234,10 @@ def test_the_emulated_rig_equals_the_direct_twin(tmp_path: Path, direct: Path) -
 
 @pytest.fixture
 def devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Emulation, dict[str, str]]]:
-    """Devices that are real as far as the rig knows: on pseudo-terminals, in real time, behind a supervisor."""
-    monkeypatch.setattr("disco_twin.firmware.omicron.EMISSION_S", 0.05)  # nothing is learnt from waiting
-    monkeypatch.setattr("disco_twin.firmware.turning.SPEED_DEG_S", 720.0)
+    """Devices that are real as far as the rig knows: on pseudo-terminals, behind a supervisor, on one clock with it."""
+    clock = PatientClock()
+    for module in ("served_rig", "emulated_rig"):
+        monkeypatch.setattr(f"disco_twin.emulation.{module}.WallClock", lambda: clock)
     (tmp_path / "ports").mkdir()
     emulation = emulated_devices(FAST, seed=9)
     with Server(emulation.cables, tmp_path / "ports") as server:

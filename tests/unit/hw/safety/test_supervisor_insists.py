@@ -4,40 +4,21 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 import serial
-from supervisor_fakes import LIMIT_S, Laser, Opening, said_by, wait
+from supervisor_fakes import LIMIT_S, Laser, Opening, said_by, serving, wait
 
 from hw.base.clock import WallClock
 from hw.base.errors import SwitchedOff
 from hw.safety import supervised_device, supervisor
 from hw.safety.ports.protocol_supervised import LIFELINE, require_supervisor
-from hw.safety.supervisor import Supervisor
 from hw.serial.link import Link
-
-
-@contextmanager
-def serving(port: str) -> Iterator[tuple[socket.socket, socket.socket, threading.Thread]]:
-    """A supervisor in a thread: its lifeline, the socket of one port that is lent, and the thread."""
-    (ours, theirs), (host, lent) = socket.socketpair(), socket.socketpair()
-    thread = threading.Thread(target=Supervisor(theirs, os.getppid()).run)
-    with ours, theirs, host:
-        host.send(f"laser 500000 0 {port}".encode())
-        socket.send_fds(ours, [supervisor.LEND], [lent.fileno()])
-        lent.close()
-        thread.start()
-        assert host.recv(1) == supervisor.READY
-        yield ours, host, thread
-        ours.close()
-        thread.join(5.0)
-        assert not thread.is_alive()
 
 
 def test_a_laser_that_was_told_to_emit_is_not_given_up_and_the_user_is_told(
@@ -136,11 +117,10 @@ def test_what_the_laser_says_reaches_a_program_that_reads_slowly(laser: Laser, p
     flood = threading.Thread(target=lambda: [os.write(laser.master, b"%07d\n" % k) for k in range(60_000)])
     flood.start()
     time.sleep(0.5)
-    got = b""
-    while len(got) < 8 * 60_000:
-        piece = port.read(4096)
-        assert piece, f"silent after {len(got)} bytes"
-        got += piece
+    got, end = b"", time.monotonic() + 30.0
+    while len(got) < 8 * 60_000:  # on a busy machine there may be silence: what has been lost never comes
+        assert time.monotonic() < end, f"{len(got)} bytes came"
+        got += port.read(4096)
     flood.join()
     assert got == b"".join(b"%07d\n" % k for k in range(60_000))
 
