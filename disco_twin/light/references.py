@@ -6,11 +6,14 @@ and light reflected at it are separate layers, since R_d answers for the first a
 
 from __future__ import annotations
 
+import hashlib
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hw.base.arrays import F32
 from hw.base.errors import InputError
@@ -64,14 +67,26 @@ def save_reference(path: Path, reference: Reference) -> None:
         "radianceScale": scale,
         "noise": str(reference.noise),
         "key": reference.key,
+        "pixels": _digest(channels),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
         OpenEXR.File(header, channels).write(file.name)
 
 
+def _digest(channels: Mapping[str, NDArray[np.generic]]) -> str:
+    """Of all pixels: programs that change them may keep what they do not know, key and noise among it."""
+    digest = hashlib.blake2b(digest_size=16)
+    for name in sorted(channels):
+        digest.update(name.encode() + np.ascontiguousarray(channels[name]).tobytes())
+    return digest.hexdigest()
+
+
 def load_reference(path: Path) -> Reference:
-    """Read what `save_reference` wrote. Raises: InputError for a missing or damaged file, and for another format."""
+    """Read what `save_reference` wrote; files of before have no digest of their pixels.
+
+    Raises: InputError for a missing, damaged or changed file, and for another format.
+    """
     import OpenEXR
 
     if not path.is_file():
@@ -82,6 +97,8 @@ def load_reference(path: Path) -> Reference:
     except (OSError, RuntimeError, ValueError) as error:
         raise InputError("not a readable EXR", file=path, remedy=RENDER_AGAIN) from error
     require_version(path, header.get("formatVersion"), FORMAT_VERSION, RENDER_AGAIN)
+    if "pixels" in header and header["pixels"] != _digest(channels):
+        raise InputError("was changed by another program since it was rendered", file=path, remedy=RENDER_AGAIN)
     lasers = len(channels) // (len(HALVES) * len(LAYERS))
     names = [[[f"{layer}.{half}.{k}" for k in range(lasers)] for layer in LAYERS] for half in HALVES]
     halves = np.array([[[channels[name] for name in row] for row in rows] for rows in names])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ import trimesh
 
 from hw.base.arrays import U16
 from hw.base.errors import InputError
+from hw.interface import Aim
 from hw.record import RawImage
 from pipeline.capture.import_brackets import compare, require_agreement
 from pipeline.capture.import_description import CaptureDescription
@@ -38,6 +39,7 @@ def require_consistent(
 
     Raises: InputError where frames, capture.toml and images.csv contradict each other.
     """
+    _require_outside(file, described.rig, scan)
     check = _FrameCheck(table, described)
     done = 0
 
@@ -51,23 +53,48 @@ def require_consistent(
     addresses = sorted(plan.addresses(), key=lambda a: a.kind != "silhouette")  # stable: a wrong pose ends it early
     chosen = set(chosen_views(plan))
     silhouettes = [(a.view, image(a)) for a in addresses if a.kind == "silhouette" and a.view in chosen]
+    _require_light("silhouette", [_lit(view, raw, described) for view, raw in silhouettes], table)
     fit = examine_silhouettes(silhouettes, described.known, described.rig, scan)
-    if fit.decisive:
+    if fit.decisive or fit.hopeless:
         raise InputError(fit.problem, file=table, remedy=fit.remedy)
-    wanted, found = set(chosen_spots(plan)), list[Sighting]()
+    wanted, found, lit = set(chosen_spots(plan)), list[Sighting](), list[bool]()
     for address in addresses:
         if address.kind == "silhouette" and address.view in chosen:
             continue
         raw = image(address)
-        if address in wanted and fit.fits:
+        if address in wanted:
             seen = sighting(address.view, plan.spots[address.spot], raw, described.known, address.laser)
-            found += [] if seen is None else [seen]
+            found += [] if seen is None or not fit.fits else [seen]
+            lit.append(seen is not None)
     check.statistics.require_description(file)
+    _require_light("spot", lit, table)
     spots = examine_spots(found, described.rig, scan)
     if spots.decisive:
         raise InputError(spots.problem, file=table, remedy=spots.remedy)
     lines = [*fit.warnings(), *spots.warnings()]
     return [*(f"{table}: {line}" for line in lines), *_weak_lasers(table, described.rig, brackets)]
+
+
+def _require_outside(file: Path, rig: RigConfig, scan: trimesh.Trimesh) -> None:
+    """Refuse cameras and projector inside the scan's box. Raises: InputError."""
+    places = {f"rig.cameras[{k}]": camera.position_mm for k, camera in enumerate(rig.cameras)}
+    for key, place in (places | {"rig.projector": rig.projector.position_mm}).items():
+        if np.all((scan.bounds[0] < place) & (place < scan.bounds[1])):
+            raise InputError("lies inside the scan", file=file, key=f"{key}.position_mm", value=tuple(place),
+                             remedy="state it in mm, in the scan's frame")  # fmt: skip
+
+
+def _lit(view: int, raw: RawImage, described: CaptureDescription) -> bool:
+    return sighting(view, Aim(0, 0, 0), raw, described.known, 0) is not None
+
+
+def _require_light(kind: str, lit: Sequence[bool], table: Path) -> None:
+    """Raises: InputError where none of the images that were looked at shows anything."""
+    if lit and not any(lit):
+        remedy = "see that the frames are those of the table, and that lamp and gates were on"
+        raise InputError(
+            f"no {kind} shows any light beyond noise ({len(lit)} were looked at)", file=table, remedy=remedy
+        )
 
 
 class _FrameCheck:

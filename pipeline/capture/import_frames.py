@@ -13,7 +13,9 @@ from hw.base.arrays import U16
 from hw.base.errors import InputError
 
 KINDS = "16-bit grey PNG or TIFF"
+FORMATS = ("PNG", "TIFF")  # others are rescaled as they are read (PGM), or lose something (JPEG 2000)
 MODES = ("I;16", "I;16B", "I;16L", "I")
+PHOTOMETRIC = 262  # tag of TIFF; 0: numbers count down from white
 ORIENTATION = 274  # tag of TIFF and EXIF: how a viewer should turn the picture; 1: not at all
 
 
@@ -39,6 +41,7 @@ def read_frame(path: Path, shape: tuple[int, int], full_scale_dn: int, where: st
             warnings.simplefilter("error")  # Pillow reads a damaged file as far as it gets
             with Image.open(path) as image:
                 mode, pages = image.mode, int(getattr(image, "n_frames", 1))
+                kind, negative = str(image.format), getattr(image, "tag_v2", {}).get(PHOTOMETRIC) == 0
                 turned = image.getexif().get(ORIENTATION, 1)
                 pixels = np.asarray(image)
     except FileNotFoundError as error:
@@ -57,6 +60,13 @@ def read_frame(path: Path, shape: tuple[int, int], full_scale_dn: int, where: st
     if pages > 1:
         remedy = "save every page as a file of its own, a line each"
         raise InputError(f"holds {pages} pages ({where})", file=path, allowed="one", remedy=remedy)
+    if kind not in FORMATS:
+        remedy = "save the sensor's raw numbers without loss"
+        raise InputError(f"is of another format ({where})", file=path, value=kind, allowed=KINDS, remedy=remedy)
+    if negative:
+        remedy = "save it with black as zero (PhotometricInterpretation 1)"
+        raise InputError(f"counts down from white ({where})", file=path, key="PhotometricInterpretation", value=0,
+                         allowed="1", remedy=remedy)  # fmt: skip
     if mode not in MODES:
         remedy = "save the sensor's raw numbers, not a picture for the screen"
         raise InputError("is not 16-bit grey", file=path, value=mode, allowed=KINDS, remedy=remedy)

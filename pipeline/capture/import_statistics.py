@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hw.base.arrays import I64, U16
+from hw.base.arrays import F64, I64, U16
 from hw.base.errors import InputError
 from hw.record import Sensor
 from pipeline.capture.import_brackets import CLIPPED, OFFSET_DN, Pair
@@ -19,6 +19,7 @@ DARK_SHARE = 0.02  # of a frame's pixels that may lie below the black level for 
 PEAK = 10.0  # times as frequent as the numbers below it is the one that a sensor clips at
 WINDOWS = (1, 8)  # widths in DN of such a peak: exact, or blurred by the noise of a full well
 DISTINCT = 32  # numbers that must occur before their spacing tells anything
+MOSAIC = 1.3  # times the light, that no grey camera's odd pixels have of its even ones over all frames
 BENT = 0.08  # by which the power law of a bracket may differ from a straight line
 PAIRS = 4  # brackets, to say so
 
@@ -26,7 +27,8 @@ PAIRS = 4  # brackets, to say so
 @dataclass
 class FrameStatistics:
     """Collected frame by frame. counts: (65536,) how often every digital number occurs; dark: frames that lie below
-    the black level by more than noise, of `frames`; lowest_dn: the darkest percent there.
+    the black level by more than noise, of `frames`; lowest_dn: the darkest percent there; phases: (2, 2) light of the
+    pixels in even and odd rows and columns.
     """
 
     sensor: Sensor
@@ -36,6 +38,7 @@ class FrameStatistics:
     dark: int = 0
     lowest_dn: list[float] = field(default_factory=list)
     pairs: list[Pair] = field(default_factory=list)
+    phases: F64 = field(default_factory=lambda: np.zeros((2, 2)))
 
     @property
     def noise_dn(self) -> float:
@@ -52,6 +55,7 @@ class FrameStatistics:
         found = np.bincount(pixels.ravel(), minlength=1 << 16)
         self.counts += found
         self.frames += 1
+        self.phases += [[float(pixels[i::2, j::2].mean()) - self.sensor.offset_dn for j in (0, 1)] for i in (0, 1)]
         low = np.arange(1 << 16) < self.floor_dn
         if found[low].sum() > DARK_SHARE * pixels.size:
             self.dark += 1
@@ -60,6 +64,7 @@ class FrameStatistics:
     def require_description(self, file: Path) -> None:
         """Raises: InputError where the numbers of all frames contradict capture.toml."""
         self._require_spacing(file)
+        self._require_grey(file)
         self._require_saturation(file)
         self._require_straight(file)
         self._require_black(file)
@@ -95,6 +100,16 @@ class FrameStatistics:
                 "frames is another", file=file, key="sensor.offset_dn", value=offset,
                 remedy="state their level, or switch off what the camera's software does to it",
             )  # fmt: skip
+
+    def _require_grey(self, file: Path) -> None:
+        least, most = float(self.phases.min()), float(self.phases.max())
+        if most < MOSAIC * max(least, 0.0) + OFFSET_DN * self.frames:
+            return
+        raise InputError(
+            f"every second pixel of the frames shows {most / max(least, 1.0):.2g} times the light of its neighbours: "
+            "they come from a colour camera's mosaic", file=file, key="rig.cameras",
+            remedy="take one colour's pixels alone, every second row and column, and state their size and pitch",
+        )  # fmt: skip
 
     def _require_saturation(self, file: Path) -> None:
         top = int(np.flatnonzero(self.counts).max(initial=0))
@@ -132,7 +147,7 @@ def incomplete(pixels: U16, before: U16 | None, statistics: FrameStatistics) -> 
     """Why a frame is no complete picture; None if nothing speaks against it. before: the frame before it in the table.
 
     A buffer that was read too early holds a run of one number that no sensor with noise gives, or the rest of the frame
-    before it.
+    before it. One that was blown up shows every row or column twice.
     """
     height, width = pixels.shape
     flat = pixels.ravel()
@@ -145,6 +160,10 @@ def incomplete(pixels: U16, before: U16 | None, statistics: FrameStatistics) -> 
         k = int(np.argmax(np.where(odd, lengths, 0)))
         row = int(starts[k]) // width
         return f"shows {int(values[k])} in {int(lengths[k])} pixels on end from row {row} on"
+    for name, lines in (("row", pixels), ("column", pixels.T)):
+        even = lines[: len(lines) // 2 * 2]
+        if np.ptp(pixels) > 4 * (1 + statistics.noise_dn) and np.array_equal(even[::2], even[1::2]):
+            return f"shows every {name} twice"
     if before is not None and before.shape == pixels.shape and not np.array_equal(before, pixels):
         last = pixels[-1]
         varies = np.ptp(last) > 4 and len(np.unique(last)) > 4

@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 import trimesh
 from scipy import ndimage
+from scipy.optimize import linear_sum_assignment
 
 from hw.base.arrays import F64, Bool
 from hw.record import RawImage, Sensor, to_radiance
@@ -32,6 +33,7 @@ WHOLE = 0.9  # share of an image that the scan fills at most: beyond, no outline
 SLACK = 0.35  # of the object's size, that it may lie beside its place while the poses are still to be calibrated
 BETTER = 0.5  # of what an overlap lacks, another explanation may leave at most to be the likeliest
 DECISIVE = 0.9  # overlap of another explanation that leaves no doubt
+HOPELESS = 0.4  # overlap below which no calibration finds the poses, as from another object's scan, or in other units
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,11 @@ class SilhouetteFit:
     def decisive(self) -> bool:
         """Whether another explanation fits beyond doubt."""
         return not self.fits and self.cause is not None and self.cause[1] >= DECISIVE
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether scan and silhouettes have next to nothing in common."""
+        return not self.fits and self.stated < HOPELESS
 
     @property
     def problem(self) -> str:
@@ -144,7 +151,7 @@ def examine_silhouettes(
     for view, raw in images:
         rows, columns, pixels = pixel_grid(raw.charge.shape, GRID)
         expected = surface.meets(*own(view).rays(pixels)).reshape(len(rows), len(columns))
-        if expected.any() and expected.mean() <= WHOLE:
+        if expected.mean() <= WHOLE:
             found.append(silhouette(view, raw, sensor, float(expected.mean())))
             stated.append(shifted_overlap(found[-1].mask, expected, slack))
             views.append(view)
@@ -177,7 +184,7 @@ def silhouettes_of(stream: StreamReader) -> Iterable[tuple[int, RawImage]]:
 
 # ---- other explanations
 
-Rows = tuple[tuple[int, int, int], tuple[int, int, int], tuple[int, int, int]]
+Rows = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 AS_IT_IS: Rows = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 
@@ -228,6 +235,8 @@ POSES = (
     Slip("a turntable that turns the other way", "give its angles the other sign", sign=-1),
     *(Slip(f"angles off by {by} deg", f"add {by} deg to the turntable's angles, or turn the scan into its frame",
            offset_deg=by) for by in (90, 180, 270)),
+    Slip("a scan in cm", "export it in mm", axes=((10, 0, 0), (0, 10, 0), (0, 0, 10))),
+    Slip("a scan in inches", "export it in mm", axes=((25.4, 0, 0), (0, 25.4, 0), (0, 0, 25.4))),
     *(Slip(f"a turntable the other way and off by {by} deg", f"give its angles the other sign and add {by} deg",
            sign=-1, offset_deg=by) for by in (90, 180, 270)),
     Slip("a scan with y up", "export it with z up", axes=((1, 0, 0), (0, 0, -1), (0, 1, 0))),
@@ -258,8 +267,39 @@ def _others(
         Slip(f"the cameras {rig.cameras[a].name} and {rig.cameras[b].name} exchanged", "exchange their names in the "
              "table or in rig.cameras", exchanged=(a, b)) for a, b in pairs
     ]  # fmt: skip
-    for slip in (*POSES, *swaps):
+
+    def tried(slip: Slip) -> tuple[str, float, str] | None:
         expected = projected(slip.scan(mesh), partial(slip.camera, rig))
-        if any((a != b).any() for a, b in zip(expected, nominal, strict=True)):
-            out.append((slip.name, mean(masks, expected), slip.remedy))
-    return out
+        if all((a == b).all() for a, b in zip(expected, nominal, strict=True)):
+            return None
+        return slip.name, mean(masks, expected), slip.remedy
+
+    out += [other for slip in (*POSES, *swaps) if (other := tried(slip)) is not None]
+    turns = {by: other for by in range(15, 360, 15) if by % 90 and (other := tried(_turned(by))) is not None}
+    if turns:
+        coarse = max(turns, key=lambda by: turns[by][1])
+        near = [turns[coarse], *(tried(_turned(coarse + by)) for by in (-10, -5, 5, 10) if (coarse + by) % 90)]
+        out.append(max((other for other in near if other is not None), key=lambda other: other[1]))
+    return [*out, *_reordered(found, nominal, len(rig.turntable_angles_deg), slack)]
+
+
+def _turned(by: int) -> Slip:
+    remedy = f"add {by} deg to the turntable's angles, or turn the scan into its frame"
+    return Slip(f"angles off by {by} deg", remedy, offset_deg=by)
+
+
+def _reordered(
+    found: Sequence[Silhouette], expected: Sequence[Bool], angles: int, slack: float
+) -> list[tuple[str, float, str]]:
+    """The views of each camera in the order in which they fit best, if that is another one."""
+    order, overlaps = dict[int, int](), list[float]()
+    for camera in sorted({s.view // angles for s in found}):
+        own = [k for k, s in enumerate(found) if s.view // angles == camera]
+        table = np.array([[shifted_overlap(found[a].mask, expected[b], slack) for b in own] for a in own])
+        rows, columns = linear_sum_assignment(-table)
+        overlaps += table[rows, columns].tolist()
+        order |= {found[own[a]].view: found[own[b]].view for a, b in zip(rows, columns, strict=True) if a != b}
+    if not order:
+        return []
+    some = ", ".join(f"{a} is {b}" for a, b in list(order.items())[:4])
+    return [(f"views in another order ({some})", float(np.mean(overlaps)), "correct angle_deg, or the frames' order")]

@@ -30,11 +30,14 @@ BEAMS, SHARE = 2.0, 0.06  # a spot may be off by so many beam diameters, or by t
 LEAST = 8  # images, to say anything
 RIGHT, WRONG = 0.6, 0.5  # share of spots in their places: at least where all is right, at most where something is wrong
 OBLIQUE = 0.2  # cosine to the camera below which its image tells nothing
-AXES = {  # what people get wrong -> (u, v) of the table as the real ones, `top` being the last step
+NEARER = 0.5  # times the distance: a reading under which spots lie so much closer to their places is the right one
+AXES = {  # what people get wrong -> (u, v) of the table as the real ones, about the middle step
     "u counts the other way": ((-1, 0), (0, 1)),
     "v counts the other way": ((1, 0), (0, -1)),
     "u and v count the other way": ((-1, 0), (0, -1)),
     "u and v are exchanged": ((0, 1), (1, 0)),
+    "full_angle_deg is half of what it should be": ((2, 0), (0, 2)),
+    "full_angle_deg is twice what it should be": ((0.5, 0), (0, 0.5)),
 }
 
 
@@ -49,15 +52,19 @@ class Sighting:
 
 @dataclass(frozen=True)
 class SpotFit:
-    """Share of the spots in their places, as stated and for each other reading of u and v; None: too few to tell."""
+    """Share of the spots in their places, as stated and for each other reading of u and v; None: too few to tell.
+
+    nearer: whether under the first of the others they lie much closer to their places
+    """
 
     stated: float | None
     others: tuple[tuple[str, float], ...] = ()
+    nearer: bool = False
 
     @property
     def fits(self) -> bool:
         """Whether nothing speaks against the stated places."""
-        return self.stated is None or self.stated > WRONG
+        return self.stated is None or (self.stated > WRONG and not self.nearer)
 
     @property
     def decisive(self) -> bool:
@@ -70,14 +77,15 @@ class SpotFit:
         assert self.stated is not None
         text = f"only {100 * self.stated:.0f} % of the spots lie where projector, scan and cameras as stated put them"
         if self.decisive:
-            text += f"; likeliest cause: {self.others[0][0]} ({100 * self.others[0][1]:.0f} % then)"
+            text += f"; likeliest cause: {self.others[0][0]} ({100 * self.others[0][1]:.0f} % then"
+            text += ", and at less than half the distance)" if self.nearer else ")"
         return text + "; others: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in self.others)
 
     @property
     def remedy(self) -> str:
         """What to do about it."""
         if self.decisive:
-            return "correct u and v in images.csv, or the rig's mirror axes"
+            return "correct u and v in images.csv, or the rig's mirror axes and rig.projector.full_angle_deg"
         return "check rig.projector (place, aim, up, full_angle_deg) and u, v"
 
     def warnings(self) -> list[str]:
@@ -120,22 +128,29 @@ def examine_spots(found: Sequence[Sighting], rig: RigConfig, mesh: trimesh.Trime
     """Compare sightings with where the nominal rig puts the spots. slack: as of `examine_silhouettes`."""
     surface = RayMesh.of(mesh)
     stated = _in_place(found, rig, surface, ((1, 0), (0, 1)), slack)
-    if stated is None or stated > WRONG:
-        return SpotFit(stated)
+    if stated is None:
+        return SpotFit(None)
     others = [(name, _in_place(found, rig, surface, axes, slack)) for name, axes in AXES.items()]
-    return SpotFit(stated, tuple(sorted(((n, s) for n, s in others if s is not None), key=lambda o: -o[1])))
+    ordered = sorted(((name, other) for name, other in others if other is not None), key=lambda o: (-o[1][0], o[1][1]))
+    nearer = [name for name, other in ordered if other[0] >= RIGHT and other[1] < NEARER * stated[1]]
+    if nearer and np.inf > stated[1] > 0.5 * rig.projector.beam_diameter_mm:
+        ordered.sort(key=lambda other: other[0] != nearer[0])  # stable: that one first
+        return SpotFit(stated[0], tuple((name, other[0]) for name, other in ordered), nearer=True)
+    return SpotFit(stated[0], () if stated[0] > WRONG else tuple((name, other[0]) for name, other in ordered))
 
 
 def _in_place(
-    found: Sequence[Sighting], rig: RigConfig, surface: RayMesh, axes: tuple[tuple[int, int], tuple[int, int]],
+    found: Sequence[Sighting], rig: RigConfig, surface: RayMesh, axes: tuple[tuple[float, float], tuple[float, float]],
     slack: float,
-) -> float | None:  # fmt: skip
-    """Share of the sightings near their spot, of those whose spot the camera sees or which miss the scan; None if few.
+) -> tuple[float, float] | None:  # fmt: skip
+    """Share of the sightings near their spot, of those whose spot the camera sees or which miss the scan, and their
+    median distance from it in mm, infinite where all miss; None if few.
 
-    axes: (2, 2) sign and order of (u, v), about the middle of the steps.
+    axes: (2, 2) sign, order and scale of (u, v), about the middle of the steps.
     """
     angles, middle = len(rig.turntable_angles_deg), (rig.projector.steps - 1) / 2
     near = counted = 0
+    distances: list[float] = []
     for view in sorted({s.view for s in found}):
         own = [s for s in found if s.view == view]
         turned = turn(float(np.deg2rad(rig.turntable_angles_deg[view % angles])))
@@ -158,4 +173,5 @@ def _in_place(
             off -= np.clip(np.median(off, axis=0), -slack * surface.size, slack * surface.size)
             allowed = max(BEAMS * rig.projector.beam_diameter_mm, SHARE * surface.size)
             near += int(np.count_nonzero(np.linalg.norm(off, axis=1) < allowed))
-    return near / counted if counted >= LEAST else None
+            distances += np.linalg.norm(off, axis=1).tolist()
+    return (near / counted, float(np.median(distances or [np.inf]))) if counted >= LEAST else None

@@ -278,7 +278,7 @@ def test_references_that_are_gone_or_damaged(tmp_path: Path) -> None:
     one_line(caught, str(path), "is not a folder", "another --out")
 
 
-@pytest.mark.parametrize("change", ["rgb", "no noise", "cut", "size"])
+@pytest.mark.parametrize("change", ["rgb", "no noise", "cut", "size", "brighter"])
 def test_references_that_other_programs_saved(
     change: str, tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -296,6 +296,10 @@ def test_references_that_other_programs_saved(
         OpenEXR.File(header, dict(zip("RGB", channels.values(), strict=False))).write(str(path))
     elif change == "no noise":
         OpenEXR.File({k: v for k, v in header.items() if k != "noise"}, channels).write(str(path))
+    elif change == "brighter":
+        OpenEXR.File(header, {k: (v * np.float16(0.5)).astype(np.float16) for k, v in channels.items()}).write(
+            str(path)
+        )
     elif change == "cut":
         path.write_bytes(path.read_bytes()[:-400])
     assert not holds_reference(tmp_path, experiment, light, view)

@@ -189,6 +189,8 @@ def test_a_command_that_was_cut_short_does_not_spoil_the_switching_off(laser: La
 def test_a_program_is_told_that_its_laser_has_not_confirmed(lasers: Callable[..., Laser]) -> None:
     laser = lasers()
     link = Link("supervised://laser:" + laser.port, 500000, "laser 635 nm", WallClock())
+    while b">" not in link.read(0.5):  # it has answered the LOf of opening: else this would come to the next one
+        pass
     laser.deaf = 10**9
     LIFELINE._supervisors[-1].terminate()
     LIFELINE._supervisors[-1].wait(10.0)  # its patience is five seconds

@@ -19,11 +19,11 @@ from pipeline.capture.poses import pose_warnings, watching
 from pipeline.reconstruct.settings import ReconstructConfig
 from pipeline.run import Request, run
 from pipeline.stream.stream import StreamReader
-from tests.support.foreign_captures import HEIGHT, ForeignCapture, foreign_capture
+from tests.support.foreign_captures import HEIGHT, WIDTH, ForeignCapture, foreign_capture
 
 Change = Callable[[ForeignCapture], None]
 Pictures = NDArray[np.uint16]
-ROWS = np.arange(HEIGHT)[:, None]
+ROWS, COLUMNS = np.arange(HEIGHT)[:, None], np.arange(WIDTH)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def right() -> ForeignCapture:
 
 
 def fresh(right: ForeignCapture) -> ForeignCapture:
-    capture = ForeignCapture(right.description, right.scan)
+    capture = ForeignCapture(right.description, right.scan.copy())
     capture.frames = [type(f)(dict(f.row), f.picture.copy()) for f in right.frames]
     return capture
 
@@ -72,6 +72,30 @@ def exchanged(capture: ForeignCapture) -> None:
     for low in range(0, len(capture.frames), 2):
         a, b = capture.frames[low : low + 2]
         a.picture, b.picture = b.picture, a.picture
+
+
+def dark(kind: str) -> Change:
+    """Nothing but noise in these images."""
+
+    def change(capture: ForeignCapture) -> None:
+        rng = np.random.default_rng(0)
+        for frame in capture.frames:
+            if frame.row["kind"] == kind:
+                frame.picture = np.rint(rng.normal(64, 2.3, frame.picture.shape)).astype(np.uint16)
+
+    return change
+
+
+def angles(told: dict[float, float]) -> Change:
+    return lambda capture: capture.rows(lambda row: {"angle_deg": told[float(str(row["angle_deg"]))]})
+
+
+def stated_at(more: float) -> Change:
+    def change(capture: ForeignCapture) -> None:
+        described("[0.0, 40.0, 100.0]", str([a + more for a in (0.0, 40.0, 100.0)]))(capture)
+        angles({a: a + more for a in (0.0, 40.0, 100.0)})(capture)
+
+    return change
 
 
 def two_stops(capture: ForeignCapture) -> None:
@@ -127,6 +151,20 @@ def other_way(capture: ForeignCapture) -> None:
         (lambda c: c.rows(lambda r: {"u": r["u"] and 4095 - r["u"]}), "likeliest cause: u counts the other way"),
         (lambda c: c.rows(lambda r: {"v": r["v"] and 4095 - r["v"]}), "likeliest cause: v counts the other way"),
         (lambda c: c.rows(lambda r: {"u": r["v"], "v": r["u"]}), "likeliest cause: u and v are exchanged"),
+        (described("full_angle_deg = 5.0", "full_angle_deg = 2.5"), "full_angle_deg is half of what it should be .1"),
+        (described("full_angle_deg = 5.0", "full_angle_deg = 10.0"), "full_angle_deg is twice what it should be .1"),
+        (dark("spot"), "no spot shows any light beyond noise .33 were looked at"),
+        (dark("silhouette"), "no silhouette shows any light beyond noise .3 were looked at"),
+        (lambda c: c.scan.apply_scale(0.1), "likeliest cause: a scan in cm"),
+        (lambda c: c.scan.apply_translation((0, 0, 20)), "overlap it by 0.0.*no simple slip explains them"),
+        (described("[390.0, -120.0, 190.0]", "[0.39, -0.12, 0.19]"), "cameras.0..position_mm = .*inside the scan"),
+        (described("[590.0, 60.0, 110.0]", "[0.59, 0.06, 0.11]"), "projector.position_mm = .*inside the scan"),
+        (described("focal_length_mm = 62.0", "focal_length_mm = 0.062"), "overlap it by 0.00"),
+        (angles({0.0: 40.0, 40.0: 100.0, 100.0: 0.0}), "cause: views in another order .0 is 2, 1 is 0, 2 is 1"),
+        (stated_at(25.0), "likeliest cause: angles off by 335 deg"),
+        (every(lambda p: np.repeat(p[::2], 2, 0)), "shows every row twice"),
+        (every(lambda p: np.repeat(p[:, ::2], 2, 1)), "shows every column twice"),
+        (every(lambda p: np.rint(64 + (p - 64.0) * (1 - (ROWS + COLUMNS) % 2 / 2))), "a colour camera's mosaic"),
     ],
 )  # fmt: skip
 def test_contradictions_are_refused_before_anything_is_stored(
@@ -236,12 +274,19 @@ def saved(path: Path, **options: object) -> Path:
         ({"stack": True}, "holds 3 pages .*one.*every page as a file of its own"),
         ({"tiffinfo": {274: 3}}, "Orientation = 3: is to be turned or mirrored"),
         ({"tiffinfo": {274: 6}}, "Orientation = 6"),
+        ({"tiffinfo": {262: 0}}, "PhotometricInterpretation = 0: counts down from white"),
     ],
 )
 def test_files_that_are_not_one_picture_as_it_was_read(tmp_path: Path, options: dict[str, object], says: str) -> None:
     with pytest.raises(InputError, match=says):
         read_frame(saved(tmp_path / "a.tif", **options), (4, 6), 4095, "line 2")
     assert read_frame(saved(tmp_path / "b.tif", tiffinfo={274: 1}), (4, 6), 4095, "line 2").max() == 64
+
+
+def test_files_that_are_rescaled_as_they_are_read(tmp_path: Path) -> None:
+    saved(tmp_path / "a.pgm")
+    with pytest.raises(InputError, match="is of another format"):
+        read_frame(tmp_path / "a.pgm", (4, 6), 4095, "line 2")
 
 
 def test_numbers_with_their_bytes_exchanged(tmp_path: Path) -> None:
