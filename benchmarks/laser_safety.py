@@ -41,6 +41,7 @@ import numpy as np
 import disco_twin.firmware.omicron as omicron_firmware
 import disco_twin.firmware.turning as turning
 import hw.devices.mm_ard as board_driver
+from benchmarks.device_priority import come_first
 from benchmarks.timed_supervisor import STAMPS
 from disco_twin.emulation.bench import LAMP_LINE
 from disco_twin.emulation.emulated_rig import Emulation
@@ -69,7 +70,6 @@ GIVEN_UP_S = 3.0
 START_S = 60.0
 CLOSING_S = 0.1  # within it comes the signal after a normal end
 MUTE = 1  # the laser that falls silent
-DEVICES = 5  # real-time priority of the emulated devices
 SIGNALS = {
     "mute": signal.SIGINT,
     **{n: signal.Signals[n] for n in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGKILL", "SIGSTOP")},
@@ -179,7 +179,7 @@ def watched(numbers: Sequence[int]) -> tuple[list[Trial], list[str], bool]:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])
     forkserver.ensure_running()  # of the programs, at ordinary priority
-    first = _come_first()
+    first = come_first()
     emulation = emulated_devices(RIG, seed=1)
     trials = []
     with tempfile.TemporaryDirectory() as scratch:
@@ -269,15 +269,6 @@ def _connected(context: Any, emulation: Emulation, urls: dict[str, str], folder:
         child.join(10.0)  # it closes the port
         _end(child)
         watch.close()
-
-
-def _come_first() -> bool:
-    """Before all ordinary processes, after the supervisors; whether the system allows it."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(DEVICES))
-    except (OSError, AttributeError):
-        return False
-    return True
 
 
 def _darken(emulation: Emulation) -> None:
