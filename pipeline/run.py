@@ -118,6 +118,7 @@ def relight(models: dict[str, RelightableModel], request: Request, work: Path, s
             lights = {light.name: model.lit_by(light) for light in wanted.lights}
             shared[surface] = lights, {name: model.seen_by(camera) for name, camera in cameras.items()}
         with stages.stage(f"relight {method}"):
+            model.prepare(list(shared[surface][0].values()))
             for light, lit in shared[surface][0].items():
                 for view, seen in shared[surface][1].items():
                     _keep(work / "relit" / method / f"{light}@{view}.npy", model.image(lit, seen))

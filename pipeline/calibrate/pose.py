@@ -119,14 +119,16 @@ def _coarse(start: Sweep, masks: Sequence[Bool], mesh: trimesh.Trimesh) -> Sweep
         wrong = sum(int((mesh_mask(mesh, sweep.view(v)) ^ m).sum()) for v, m in enumerate(masks))
         if wrong < fewest:
             best, fewest = sweep, wrong
-        if fewest < GOOD_ENOUGH * sum(int(m.sum()) for m in masks):
+        area, length = sum(int(m.sum()) for m in masks), sum(float(rim.length.sum()) for rim in rims)
+        if fewest < max(GOOD_ENOUGH * area, GOOD_ENOUGH_PX * length):
             break
     return best
 
 
 _TEN = np.deg2rad(8.0)
 _STARTS = np.array([(0, 0, 0), (_TEN, 0, 0), (-_TEN, 0, 0), (0, _TEN, 0), (0, -_TEN, 0), (0, 0, _TEN), (0, 0, -_TEN)])
-GOOD_ENOUGH = 0.012  # XOR as a share of the silhouettes: no other start is tried
+# XOR as a share of the silhouettes, or by pixels along the outline, where that allows more, as it does in small images:
+GOOD_ENOUGH, GOOD_ENOUGH_PX = 0.012, 0.35  # no other start is tried then
 
 
 def _centred(sweep: Sweep, camera: int, mask: Bool, mesh: trimesh.Trimesh, nominal: PinholeCamera) -> Sweep:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from weakref import WeakKeyDictionary
@@ -30,11 +31,21 @@ class RadiosityTerm(Term):
         flux: (1 or 4, L, V) W, by direction `LightOnMesh.tilted_flux`, else the flux alone; points: (V, 3) mm
         """
 
+    def radiosities(self, fluxes: Sequence[F64], points: F64) -> list[F64]:
+        """`radiosity` of each flux."""
+        return [self.radiosity(flux, points) for flux in fluxes]
+
+    def prepare(self, lights: Sequence[LightOnMesh]) -> None:
+        """The radiosities by these lights, together."""
+        new = [light for light in lights if light not in self._by_light]
+        if new:
+            points = np.asarray(new[0].mesh.vertices, np.float64)
+            fluxes = [light.tilted_flux if self.by_direction else light.flux[None] for light in new]
+            self._by_light.update(zip(new, self.radiosities(fluxes, points), strict=True))
+
     def radiosity_under(self, light: LightOnMesh) -> F64:
         """`radiosity` by a light, worked out once."""
-        if light not in self._by_light:
-            flux = light.tilted_flux if self.by_direction else light.flux[None]
-            self._by_light[light] = self.radiosity(flux, np.asarray(light.mesh.vertices, np.float64))
+        self.prepare([light])
         return self._by_light[light]
 
     def image(self, light: LightOnMesh, view: ViewOfMesh) -> F32:

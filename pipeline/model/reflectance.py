@@ -44,22 +44,25 @@ class GlobalTerm(RadiosityTerm):
         return self.tilt is not None
 
     def radiosity(self, flux: F64, points: F64) -> F64:
-        """The radiosity, and what leaves ahead of it: sums of q R_d s e, by component.
+        """The radiosity, and what leaves ahead of it: sums of q R_d s e, by component."""
+        return self.radiosities([flux], points)[0]
 
-        The factor of either end is kept to first order, their product is left out. Some rows at a time: no matrix is
-        kept beside R_d.
+    def radiosities(self, fluxes: Sequence[F64], points: F64) -> list[F64]:
+        """The factor of either end is kept to first order, their product is left out. Some rows at a time, for all
+        fluxes: no matrix is kept beside R_d, and the kernel takes longer than its products.
         """
         if self.tilt is None or self.tilt_distance is None:
-            return np.stack([q @ r for q, r in zip(flux[0], self.reflectance, strict=True)])[None]
-        out = np.zeros((4, *flux.shape[1:]))
+            return [np.stack([q @ r for q, r in zip(f[0], self.reflectance, strict=True)])[None] for f in fluxes]
+        out = [np.zeros((4, *flux.shape[1:])) for flux in fluxes]
         for first in range(0, len(points), _ROWS):
             rows = slice(first, first + _ROWS)
             distance = cdist(points[rows], points)
             for laser, slopes in enumerate(self.tilt):
                 reflectance = self.reflectance[laser, rows].astype(np.float64)
-                out[0, laser] += flux[0, laser, rows] @ reflectance
                 kernel = tilt_kernel(reflectance, distance, TiltLaw(self.tilt_distance, slopes))
-                out[:, laser] += gathered(placed(flux[:, laser, rows], points[rows]) @ kernel, points)
+                for own, flux in zip(out, fluxes, strict=True):
+                    own[0, laser] += flux[0, laser, rows] @ reflectance
+                    own[:, laser] += gathered(placed(flux[:, laser, rows], points[rows]) @ kernel, points)
         return out
 
     def image_variance(self, light: LightOnMesh, view: ViewOfMesh) -> F32 | None:

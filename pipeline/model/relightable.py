@@ -62,6 +62,11 @@ class RelightableModel:
         """A camera's view of this model's surface. Models with the same mesh and boundary can share it."""
         return ViewOfMesh(camera, self.mesh, self.boundary)
 
+    def prepare(self, lights: Sequence[LightOnMesh]) -> None:
+        """Work out together what images under several lights need; quicker than one after the other."""
+        for term in self.terms:
+            term.prepare(lights)
+
     def image(self, light: LightOnMesh, view: ViewOfMesh) -> F32:
         """(L, H, W) radiance in W/(mm^2 sr), averaged over each pixel.
 

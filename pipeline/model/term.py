@@ -48,6 +48,9 @@ class Term(ABC):
     def image(self, light: LightOnMesh, view: ViewOfMesh) -> F32:
         """(L, H, W) radiance in W/(mm^2 sr) that the term adds, averaged over each pixel."""
 
+    def prepare(self, lights: Sequence[LightOnMesh]) -> None:  # noqa: B027 - most have nothing to prepare
+        """Work out for several lights at once what their images need, where that is quicker than one by one."""
+
     def image_variance(self, light: LightOnMesh, view: ViewOfMesh) -> F32 | None:
         """(2, L, H, W) variance of `image` by that of the term's entries, as if their errors were independent, and as
         if they were all alike; None where the term states none.

@@ -34,6 +34,8 @@ class LightOnMesh:
     @cached_property
     def moments(self) -> F64:
         """(L, V) W: integrals of the vertices' hat functions times the transmitted flux density."""
+        if "tilted_moments" in vars(self):  # they hold these: light from many directions takes seconds
+            return np.asarray(self.tilted_moments[0])
         return hat_moments(self.light, self.mesh, self.boundary, self.lasers)
 
     @cached_property
@@ -44,9 +46,12 @@ class LightOnMesh:
     @cached_property
     def tilted_flux(self) -> F64:
         """(4, L, V) W: the flux, and the flux times the mean of t, the refracted direction along the surface."""
-        return np.stack(
-            [flux_of(m, self.mesh) for m in tilted_moments(self.light, self.mesh, self.boundary, self.lasers)]
-        )
+        return np.stack([flux_of(m, self.mesh) for m in self.tilted_moments])
+
+    @cached_property
+    def tilted_moments(self) -> F64:
+        """(4, L, V) W: `moments`, and the same with the mean of t in the integral."""
+        return tilted_moments(self.light, self.mesh, self.boundary, self.lasers)
 
 
 @dataclass(frozen=True, eq=False)

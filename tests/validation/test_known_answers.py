@@ -20,7 +20,7 @@ F64 = NDArray[np.float64]
 REPLICATES = 32
 
 
-@pytest.mark.parametrize("n", [1.0, 1.3, 1.5])
+@pytest.mark.parametrize("n", [1.0, pytest.param(1.3, marks=pytest.mark.slow), 1.5])
 def test_half_space(n: float) -> None:
     """Rationale: reflectance of a half-space with a smooth boundary, three albedos in one walk.
 

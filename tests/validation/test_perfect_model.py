@@ -127,7 +127,11 @@ def scored_as_perfect(estimate: Truth, truth: Truth, model: Callable[[F64], F64]
 
 @pytest.mark.parametrize(
     ("shape", "kind", "eta", "g"),
-    [("sphere", "rough", 1.5, 0.0), ("torus", "rough", 1.4, 0.6), ("box", "matched", 1.0, 0.0)],
+    [
+        pytest.param("sphere", "rough", 1.5, 0.0, marks=pytest.mark.slow),
+        ("torus", "rough", 1.4, 0.6),
+        ("box", "matched", 1.0, 0.0),
+    ],
 )
 def test_a_model_made_of_one_truth_is_perfect_by_another(shape: str, kind: str, eta: float, g: float) -> None:
     """Expected behaviour: log10 rmse 0, totals 1 and z-scores 1 within their errors, the same for every boundary that

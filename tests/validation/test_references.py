@@ -50,6 +50,7 @@ def test_shipped_references_belong_to_the_scene(repository: Path) -> None:
             assert reference.halves.shape == (2, 2, len(scene.rig.lasers), view.height, view.width)
 
 
+@pytest.mark.slow
 def test_a_shipped_reference_is_rendered_again(repository: Path) -> None:
     """Expected: new photons, few of them, agree with the shipped image block by block, layer by layer; with one that is
     three per cent brighter they do not.

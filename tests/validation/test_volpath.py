@@ -69,7 +69,9 @@ def blocks(images: np.ndarray) -> np.ndarray:
 CASES = [
     pytest.param(TwinBoundary("rough", 1.3, 0.3), False, "uniform", id="rough-homogeneous-uniform"),
     pytest.param(TwinBoundary("rough", 1.5, 0.4), True, "directional", id="rough-heterogeneous-directional"),
-    pytest.param(TwinBoundary("matched", 1.0, 0.0), True, "directional", id="matched-heterogeneous-directional"),
+    pytest.param(
+        TwinBoundary("matched", 1.0, 0.0), True, "directional", id="matched-heterogeneous", marks=pytest.mark.slow
+    ),
 ]
 
 

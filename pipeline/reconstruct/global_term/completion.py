@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg
-from scipy.stats import chi2
+from scipy.special import chdtri  # scipy.stats takes most of a second to import
 
 from hw.base.arrays import F32, F64, Bool
 from pipeline.geometry.mesh import RayMesh
@@ -29,7 +29,7 @@ from pipeline.model.tilt import TiltLaw
 from pipeline.reconstruct.global_term.boundary_fit import measure_boundary, of_mean_one
 from pipeline.reconstruct.global_term.harmonics import Harmonics, harmonics
 from pipeline.reconstruct.global_term.prior import FAR, deviation, medium_priors
-from pipeline.reconstruct.global_term.radial_profile import TILT_EDGES, ProfileFit, fit_profile
+from pipeline.reconstruct.global_term.radial_profile import TILT_EDGES, ProfileFit, fit_profile, plain_profile
 from pipeline.reconstruct.global_term.totals import steady_totals
 from pipeline.reconstruct.medium.medium_fit import MediumPrior
 from pipeline.reconstruct.samples.laser_samples import LaserSamples
@@ -136,7 +136,10 @@ def fit_laser(
     found: ProfileFit | None = None
     smooth = known + scale * field.at_spots(y)
     for _ in range(ROUNDS):
-        found = fit_profile(pairs, measured, edge, samples.tilt, smooth, found)
+        if np.any(smooth):
+            found = fit_profile(pairs, measured, edge, samples.tilt, smooth, found)
+        else:
+            found = plain_profile(samples, laser)
         prior = pairs.mean(found.profile) * found.tilt.factor(pairs.distance, samples.tilt)
         for _ in range(ROUNDS):
             relative, weight = measured.residual(prior * np.exp(smooth))
@@ -250,7 +253,7 @@ def complete(samples: Samples) -> RelightableModel:
     expected_totals = np.stack([medium.totals for medium in media]) if media else None
     reflectance = steady_totals(reflectance, relative, leaves, level, basis, edge, expected_totals)
     variance = (reflectance**2 * (relative + BOTH_ENDS)).astype(np.float32)
-    limit = float(chi2.ppf(1 - TILT_BY_CHANCE, len(TILT_EDGES)))
+    limit = float(chdtri(len(TILT_EDGES), TILT_BY_CHANCE))
     tilted = max(fit.tilt_chi2 for fit in fits) > limit
     term = GlobalTerm(
         reflectance.astype(np.float32),

@@ -10,7 +10,7 @@ import logging
 import numpy as np
 
 from hw.base.arrays import F64
-from pipeline.reconstruct.global_term.radial_profile import fit_profile
+from pipeline.reconstruct.global_term.radial_profile import fit_profile, plain_profile
 from pipeline.reconstruct.medium.diffusion import Diffusion
 from pipeline.reconstruct.medium.medium_fit import HomogeneousMedium, MediumPrior, fit_medium
 from pipeline.reconstruct.medium.tetrahedra import NoMedium
@@ -32,14 +32,19 @@ def deviation(edges: F64, far: float) -> F64:
     return np.minimum(NEAR + (FAR - NEAR) * -np.expm1(-((edges / TURN_EDGES) ** 2)), far)
 
 
-def far_scatter(samples: Samples, laser: int, at_spots: F64 | float) -> float:
+def far_scatter(samples: Samples, laser: int, at_spots: F64 | None = None) -> float:
     """Of the logarithms of an object's own samples, far from their spots, about their prior: without their noise.
 
-    at_spots: (S, V) `MediumPrior.at_spots`, or 0. NaN where too few samples are clear of the noise.
+    at_spots: (S, V) `MediumPrior.at_spots`, or None. NaN where too few samples are clear of the noise.
     """
     measured, pairs = LaserSamples.of(samples, laser), samples.spot_pairs
-    fit = fit_profile(pairs, measured, samples.edge, samples.tilt, at_spots)
-    expected = pairs.mean(fit.profile) * fit.tilt.factor(pairs.distance, samples.tilt) * np.exp(at_spots)
+    if at_spots is None:
+        fit = plain_profile(samples, laser)
+    else:
+        fit = fit_profile(pairs, measured, samples.edge, samples.tilt, at_spots)
+    expected = pairs.mean(fit.profile) * fit.tilt.factor(pairs.distance, samples.tilt)
+    if at_spots is not None:
+        expected *= np.exp(at_spots)
     far = measured.observed & (measured.edges > BETWEEN[0]) & (measured.edges < BETWEEN[1])
     noise = measured.variance(expected)
     clear = far & (noise < CLEAR)
@@ -55,7 +60,7 @@ def medium_priors(samples: Samples) -> tuple[list[MediumPrior], float, str]:
     the middle wavelength, which stands for all, in bounds); and why there is none.
     """
     middle = len(samples.values) // 2
-    alone = _credited(far_scatter(samples, middle, 0.0), np.inf)
+    alone = _credited(far_scatter(samples, middle), np.inf)
     try:
         diffusion, found = Diffusion.of(samples.mesh, samples.eta), list[HomogeneousMedium]()
         for laser in range(len(samples.values)):

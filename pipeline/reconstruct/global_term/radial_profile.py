@@ -132,11 +132,21 @@ def _bend(n: int) -> F64:
     return np.asarray(second.T @ second)
 
 
+def plain_profile(samples: Samples, laser: int) -> ProfileFit:
+    """`fit_profile` to one laser's samples as they are, worked out once for all who start from it."""
+    key = "plain profile", laser
+    if key not in samples.shared:
+        measured = LaserSamples.of(samples, laser)
+        samples.shared[key] = fit_profile(samples.spot_pairs, measured, samples.edge, samples.tilt)
+    found: ProfileFit = samples.shared[key]
+    return found
+
+
 def over_directions(samples: Samples, laser: int) -> tuple[LaserSamples, Profile]:
     """One laser's samples with the tilt taken out, and the profile: what the simple models are fitted to.
 
     They have no directions; a mean over those that the cameras happened to look from would be too low.
     """
     measured, distance = LaserSamples.of(samples, laser), samples.spot_pairs.distance
-    fit = fit_profile(samples.spot_pairs, measured, samples.edge, samples.tilt)
+    fit = plain_profile(samples, laser)
     return replace(measured, value=measured.value / fit.tilt.factor(distance, samples.tilt)), fit.profile

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from functools import cache, cached_property
 from itertools import product
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.stats import norm
+from scipy.special import log_ndtr  # scipy.stats takes most of a second to import
 
 from hw.base.arrays import F64
 from pipeline.reconstruct.global_term.harmonics import Harmonics
@@ -31,17 +32,39 @@ STEPS = 200
 
 
 @dataclass(frozen=True)
-class Kriging:
-    """A Gaussian field z = mean + U a, a ~ N(0, diag(spectrum)), observed with an error U b, b ~ N(0, diag(shared)),
-    that is smooth itself, and with noise of (V,) variances.
-
-    functions: (V, n) U; spectrum, shared: (n,); noise: (V,)
-    """
+class ObservedField:
+    """A field's observations at V places. functions: (V, n) U; noise: (V,) variances"""
 
     functions: F64
+    noise: F64
+
+    @cached_property
+    def weighted(self) -> F64:
+        """(V, n) noise^-1 U."""
+        return np.asarray(self.functions / self.noise[:, None])
+
+    @cached_property
+    def told(self) -> F64:
+        """(n, n) U^T noise^-1 U: what they tell of the coefficients."""
+        return np.asarray(self.functions.T @ self.weighted)
+
+
+@dataclass(frozen=True)
+class Kriging:
+    """A Gaussian field z = mean + U a, a ~ N(0, diag(spectrum)), observed with an error U b, b ~ N(0, diag(shared)),
+    that is smooth itself, and with a noise of its own.
+
+    seen: the observations' noise and what they tell of U's coefficients; spectrum, shared: (n,)
+    """
+
+    seen: ObservedField
     spectrum: F64
     shared: F64
-    noise: F64
+
+    @property
+    def functions(self) -> F64:
+        """(V, n) U."""
+        return self.seen.functions
 
     def posterior(self, observed: F64) -> tuple[F64, F64]:
         """(V,) mean and variance of z given the observations (Rasmussen & Williams 2006, eq. 2.25, 2.26; its mean by
@@ -62,15 +85,15 @@ class Kriging:
 
     def _solved(self, observed: F64) -> tuple[tuple[F64, bool], float, F64, float]:
         """The factored precision of a + b; the level; (V,) inverse covariance times the rest; and log determinant."""
-        weighted, both = self.functions / self.noise[:, None], self.spectrum + self.shared
-        factor = cho_factor(self.functions.T @ weighted + np.diag(1.0 / both))
+        weighted, noise, both = self.seen.weighted, self.seen.noise, self.spectrum + self.shared
+        factor = cho_factor(self.seen.told + np.diag(1.0 / both))
 
         def whitened(x: F64) -> F64:
-            return np.asarray(x / self.noise - weighted @ cho_solve(factor, weighted.T @ x))
+            return np.asarray(x / noise - weighted @ cho_solve(factor, weighted.T @ x))
 
         one = np.ones(len(observed))
         level = float((whitened(one) @ observed) / (whitened(one) @ one))
-        size = 2 * np.log(np.diag(factor[0])).sum() + np.log(both).sum() + np.log(self.noise).sum()
+        size = 2 * np.log(np.diag(factor[0])).sum() + np.log(both).sum() + np.log(noise).sum()
         return factor, level, whitened(observed - level), float(size)
 
 
@@ -98,10 +121,13 @@ def steady_totals(
     known = np.log(total * exitance_per_flux) - shape
     shared = _spectrum(basis, SHARED_RANGE * edge, size)
 
+    @cache  # for all lengths and deviations
+    def seen(laser: int, common: float) -> ObservedField:
+        return ObservedField(basis.functions, open_deviation[laser] ** 2 + common**2)
+
     def field(laser: int, choice: tuple[float, float, float]) -> Kriging:
         length, deviation, common = choice
-        own = _spectrum(basis, length * edge, deviation)
-        return Kriging(basis.functions, own, shared, open_deviation[laser] ** 2 + common**2)
+        return Kriging(seen(laser, common), _spectrum(basis, length * edge, deviation), shared)
 
     choices = list(product(RANGES, DEVIATIONS, COMMON))
     middle = len(known) // 2  # one wavelength tells the lengths of all
@@ -125,7 +151,8 @@ def _spectrum(basis: Harmonics, range_mm: float, deviation: float) -> F64:
 def at_most_zero(mean: F64, deviation: F64) -> F64:
     """Expectation of a normal variable that is known to be at most 0."""
     edge = -mean / deviation
-    return np.asarray(mean - deviation * np.exp(norm.logpdf(edge) - norm.logcdf(edge)))
+    density = -(edge**2) / 2.0 - np.log(np.sqrt(2 * np.pi))  # its logarithm
+    return np.asarray(mean - deviation * np.exp(density - log_ndtr(edge)))
 
 
 def scaling(reflectance: F64, area: F64, wanted: F64) -> F64:

@@ -97,6 +97,11 @@ class Samples:
         return np.asarray(self.dark_variance + self.noise_per_signal * np.maximum(self.values, 0.0))
 
     @cached_property
+    def shared(self) -> dict[Any, Any]:
+        """What methods work out of these readings alone and hand on to each other, by keys of their own."""
+        return {}
+
+    @cached_property
     def spot_pairs(self) -> Pairs:
         """Distances between the beams and the hat functions."""
         return spot_pairs(self.mesh, self.spots)

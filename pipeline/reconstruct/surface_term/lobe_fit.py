@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri  # scipy.stats takes most of a second to import
 
 from hw.base.arrays import F64, Bool
 from pipeline.calibrate.least_squares import Huber
@@ -115,7 +115,7 @@ def _beyond(samples: Samples, grey: LaserSamples, expected: F64) -> SurfaceLobe:
     strengths = REFLECTANCES / unit
     lobes = [np.bincount(readings.spot, beams.in_samples(a) * weight, count)[used].astype(np.float64) for a in ALPHAS]
     cost, gain = _tried(at_centre[used], others, lobes, strengths)
-    limit = float(chi2.ppf(1 - BY_CHANCE, 2))
+    limit = float(chdtri(2, BY_CHANCE))
     if gain <= limit:
         why = f"spots are no brighter toward the mirror direction beyond their scatter (chi^2 at most {limit:.0f})"
         return SurfaceLobe(because=why)

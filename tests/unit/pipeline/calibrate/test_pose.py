@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.calibrate import pose
 from pipeline.calibrate.pose import PoseFit, fit_poses
+from pipeline.calibrate.sweep import Sweep
 from pipeline.geometry.camera import PinholeCamera, turn
 
 
@@ -72,6 +74,25 @@ def test_a_broken_stage_shows(seen: Silhouettes, monkeypatch: pytest.MonkeyPatch
         turned, moved = errors(found, seen.truth[:3])
         across, about = np.abs(moved[:, :2]).max(), np.linalg.norm(turned, axis=1).max()
         assert across > 0.15 or about > 0.1 or found.residual_px > 0.2
+
+
+def test_small_images_need_no_other_start_either(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rationale: of few pixels more lie on the outline. Expected: one start for each camera, in images of a quarter of
+    the pixels too, and from it a pose good enough for the fine stage, which reaches two pixels of .6 mm.
+    """
+    rig, mesh, starts = faulty_rig(96), experiment().scan, list[int]()
+    seen, whole = silhouettes(4, mesh, rig), pose._centred
+
+    def counted(sweep: Sweep, camera: int, *rest: Any) -> Sweep:
+        starts.append(camera)
+        return whole(sweep, camera, *rest)
+
+    monkeypatch.setattr(pose, "_centred", counted)
+    monkeypatch.setattr(pose, "_fine", lambda sweep, *_: sweep)
+    found: Any = fit_poses(seen.images, mesh, seen.lenses, seen.angles)
+    assert starts == [0, 1]
+    shift = [t.pose[:2, 3] - found.view(v).pose[:2, 3] for v, t in enumerate(seen.truth)]
+    assert np.abs(shift).max() < 0.6
 
 
 def test_a_symmetric_object_gets_a_stated_ambiguity() -> None:

@@ -166,3 +166,14 @@ def test_units_do_not_matter() -> None:
     of = RelightableModel(mesh, Boundary(1.3), (grown,))
     image = of.image(of.lit_by(SUN), of.seen_by(eye))
     np.testing.assert_allclose(image, picture(model()), atol=2e-3 * image.max())
+
+
+def test_lights_that_are_prepared_together_give_the_same_images() -> None:
+    """Bit for bit: the kernel is made once, its products are those of one light."""
+    lights = [Directional(direction=(0.3, -0.2, -1)), Uniform()]
+    view = model().seen_by(CAMERA)
+    together, alone = model(), model()
+    lit = [together.lit_by(light) for light in lights]
+    together.prepare(lit)
+    for light, own in zip(lights, lit, strict=True):
+        np.testing.assert_array_equal(together.image(own, view), alone.image(alone.lit_by(light), view))

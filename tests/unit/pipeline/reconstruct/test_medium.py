@@ -268,9 +268,9 @@ def test_the_scatter_far_from_spots_is_that_of_the_object(diffuse: Synthetic, sc
     """Rationale: known log-normal deviations from the profile. Where noise hides all, FAR holds."""
     samples, rng = diffuse.samples, np.random.default_rng(5)
     values = samples.values * np.exp(scatter * rng.standard_normal(samples.values.shape)).astype(np.float32)
-    assert far_scatter(samples.with_readings(values=values), 0, 0.0) == pytest.approx(scatter, rel=0.1)
+    assert far_scatter(samples.with_readings(values=values), 0) == pytest.approx(scatter, rel=0.1)
     loud = replace(samples, noise_per_signal=samples.noise_per_signal + np.nanmax(samples.values))
-    assert np.isnan(far_scatter(loud, 0, 0.0))
+    assert np.isnan(far_scatter(loud, 0))
     assert medium_priors(loud)[:2] == ([], FAR)
 
 

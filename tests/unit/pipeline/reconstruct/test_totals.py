@@ -14,6 +14,7 @@ from pipeline.reconstruct.global_term.totals import (
     SHARED,
     SHARED_RANGE,
     Kriging,
+    ObservedField,
     at_most_zero,
     scaling,
     steady_totals,
@@ -26,7 +27,7 @@ def test_kriging_agrees_with_the_dense_formulas() -> None:
     u, spectrum, noise = rng.standard_normal((40, 12)), rng.uniform(0.1, 1, 12), rng.uniform(0.1, 0.5, 40)
     shared = rng.uniform(0.05, 0.5, 12)
     observed = 3.0 + u @ (np.sqrt(spectrum) * rng.standard_normal(12)) + np.sqrt(noise) * rng.standard_normal(40)
-    kriging = Kriging(u, spectrum, shared, noise)
+    kriging = Kriging(ObservedField(u, noise), spectrum, shared)
     mean, variance = kriging.posterior(observed)
     signal = (u * spectrum) @ u.T
     whole, one = signal + (u * shared) @ u.T + np.diag(noise), np.ones(40)

@@ -111,3 +111,14 @@ def test_moments_and_flux_come_from_one_integration(monkeypatch: pytest.MonkeyPa
     assert lit.flux.shape == lit.moments.shape == (2, 8)
     assert lit.flux.sum() == pytest.approx(lit.moments.sum(), rel=1e-12)
     assert len(asked) == 1
+
+
+def test_tilted_moments_hold_the_plain_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rationale: a model with directions asks for both. Expected: one integration, the same numbers either way."""
+    mesh = trimesh.creation.box(extents=(20, 30, 24))
+    plain = LightOnMesh(Uniform(), mesh, Boundary(1.3), 2)
+    lit = LightOnMesh(Uniform(), mesh, Boundary(1.3), 2)
+    expected, tilted = plain.flux, lit.tilted_flux
+    monkeypatch.setattr(on_mesh, "hat_moments", None)
+    np.testing.assert_array_equal(lit.flux, expected)
+    np.testing.assert_array_equal(tilted[0], expected)
