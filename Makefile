@@ -6,7 +6,7 @@ READY := $(VENV)/.installed
 OUT ?= out/quick
 unexport PYTHONDONTWRITEBYTECODE  # containers set it; each of the many processes would compile all that it imports
 
-.PHONY: demo test lint validate install references outside accuracy picture curves soak clean
+.PHONY: demo test lint validate install references outside accuracy picture curves soak stability clean
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -20,6 +20,7 @@ help:
 	@echo "make accuracy  the default beside all baselines on objects that nothing was chosen on (most of an hour)"
 	@echo "make soak      20,000 images with faults, kills and resumes: nothing grows, every image is right (minutes)"
 	@echo "make curves    error against seconds of the light's estimators: docs/benchmarks/walk.svg (minutes)"
+	@echo "make stability the stress suite of all numerical kernels: docs/stability.md (minutes)"
 	@echo "make picture   the README's picture, from the demo's run"
 
 install: $(READY)
@@ -90,6 +91,10 @@ curves: $(READY)
 
 soak: $(READY)
 	$(BIN)/python -m benchmarks soak --json $(VENV)/soak.json
+
+stability: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks stability --json docs/benchmarks/stability.json
+	$(BIN)/python -m benchmarks.stability.page docs/benchmarks/stability.json docs/stability.md
 
 clean:
 	rm -rf $(VENV) out build dist

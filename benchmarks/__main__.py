@@ -34,6 +34,7 @@ REGISTRY = {
     "relight": "benchmarks.relight",
     "resample": "benchmarks.resample",
     "soak": "benchmarks.soak",
+    "stability": "benchmarks.stability",
     "stream": "benchmarks.stream",
     "walk": "benchmarks.walk",
 }

@@ -16,8 +16,11 @@ from pydantic import Field
 from hw.base.arrays import F32, F64, U8, U16, Bool
 
 # Bounds of what files state; they are checked where a file is read.
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, le=1e12, allow_inf_nan=False)]
+Exposure = Annotated[float, Field(ge=1e-9, le=1e4, allow_inf_nan=False)]
+Gain = Annotated[float, Field(ge=1e-6, le=1e9, allow_inf_nan=False)]
+Responsivity = Annotated[float, Field(ge=1e-3, le=1e18, allow_inf_nan=False)]  # single precision holds the variances
+Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
@@ -43,16 +46,16 @@ class Sensor:
         for, from 0 to 1; empty where both are the same. Below the offset it goes on as its mirror image
     """
 
-    longest_exposure_s: Positive
+    longest_exposure_s: Exposure
     steps: Annotated[int, Field(ge=1, le=24)]  # exponents run from 0 to steps - 1
     bits: Annotated[int, Field(ge=1, le=16)]  # the charge is digitised to 0 .. 2**bits - 1
-    gain_e_per_dn: Positive
+    gain_e_per_dn: Gain
     read_noise_e: NotNegative
     dark_e_per_s: NotNegative
     offset_dn: NotNegative
-    responsivity: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    responsivity: Annotated[tuple[Responsivity, ...], Field(min_length=1)]
     decision_e: NotNegative = 0.0
-    response: tuple[float, ...] = ()
+    response: tuple[Share, ...] = ()
 
     @property
     def saturation_dn(self) -> int:

@@ -57,9 +57,9 @@ def integrate(rate: F64, sensor: Sensor, rng: Generator) -> Exposed:
 
 def expected_variance(radiance: F64, sensor: Sensor, laser: int) -> F64:
     """Variance that the camera adds to a radiance, same shape, in (W/(mm^2 sr))^2: photons, dark signal, read-out and
-    digits, at the exposure that `integrate` chooses in the mean.
+    digits, at the exposure that `integrate` chooses in the mean. What is below 0, by noise, counts as dark.
     """
-    rate = photoelectrons(radiance, sensor, laser) + sensor.dark_e_per_s
+    rate = photoelectrons(np.maximum(radiance, 0.0), sensor, laser) + sensor.dark_e_per_s
     longest = rate * sensor.longest_exposure_s
     with np.errstate(divide="ignore"):
         halvings = np.ceil(np.log2(longest / max(sensor.decision_e, 1e-9))) - 1

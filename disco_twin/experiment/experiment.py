@@ -10,8 +10,7 @@ import numpy as np
 import trimesh
 
 from disco_twin.experiment.object_pixels import ObjectPixels
-from disco_twin.object.bodies import OwnMedium
-from disco_twin.object.build import TwinObject, build_object, build_scan
+from disco_twin.object.build import TwinObject, build_object, build_scan, rounding
 from hw.base.arrays import Bool
 from hw.base.errors import InputError
 from pipeline.geometry.camera import PinholeCamera
@@ -108,9 +107,7 @@ class Experiment:
 
 def rounding_warning(obj: TwinObject) -> str | None:
     """A line where free paths are so short that single precision shows; None elsewhere (docs/decisions/0133)."""
-    own = [max(body.medium.sigma_t) for body in obj.inside if isinstance(body.medium, OwnMedium)]
-    sigma_t, reach = max(float(obj.medium.sigma_t.max()), *own, 0.0), float(np.abs(obj.mesh.bounds).max())
-    share = sigma_t * float(np.spacing(np.float32(reach)))
+    share, reach, sigma_t = rounding(obj)
     if share < ROUGH:
         return None
     problem = (

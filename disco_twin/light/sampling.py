@@ -46,12 +46,21 @@ class Rng:
 
     def next(self) -> Any:
         """Uniform Float in [0, 1) with 23 bits."""
+        return dr.reinterpret_array(mi.Float, (self._bits() >> 9) | mi.UInt32(0x3F800000)) - 1.0
+
+    def fine(self) -> Any:
+        """The same number with all of its 32 bits, as far as a Float holds them, in [0, 1]: for small chances. One of
+        1e-8 would else happen as often as one of 1.2e-7.
+        """
+        return mi.Float(self._bits()) * 2.0**-32
+
+    def _bits(self) -> Any:
         s0, s1 = self.s0, self.s1
         result = s0 * mi.UInt32(0x9E3779BB)
         s1 = s1 ^ s0
         self.s0 = ((s0 << 26) | (s0 >> 6)) ^ s1 ^ (s1 << 9)
         self.s1 = (s1 << 13) | (s1 >> 19)
-        return dr.reinterpret_array(mi.Float, (result >> 9) | mi.UInt32(0x3F800000)) - 1.0
+        return result
 
     def next2(self) -> Any:
         """Two uniform numbers as a Point2f."""

@@ -151,7 +151,7 @@ def collide(
     sigma_t = chance * t.majorant
     if dr.hint(t.walls is not None, mode="scalar"):
         sigma_t, albedo, g = medium_in(t.walls, photon.region, sigma_t, albedo, g)
-    if dr.hint(rng.next() * rate < sigma_t):
+    if dr.hint(rng.fine() * rate < sigma_t):
         sums.absorbed += type(sums.absorbed)(photon.w * (1.0 - albedo))
         photon.w *= albedo
         near = near_surface(t, photon.empty)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 import trimesh
 
 from disco_twin.object import shapes
@@ -25,7 +26,9 @@ from pipeline.geometry.surface_from_points import reconstruct_surface
 if TYPE_CHECKING:
     from disco_twin.scene.scene import Scene
 
-__all__ = ["Medium", "TwinBoundary", "TwinObject", "build_object", "build_scan", "hat_basis"]
+MOST_ROUNDING = 0.1  # of a free path
+
+__all__ = ["Medium", "TwinBoundary", "TwinObject", "build_object", "build_scan", "hat_basis", "rounding"]
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,30 @@ def build_object(scene: Scene) -> TwinObject:
     named = [*shells, *bodies_of(scene.object.inside, boundary.eta, len(wavelengths), _mesh, first)]
     check_nesting(outer, named)
     medium = build_medium(scene.object.medium, outer, wavelengths)
-    return TwinObject(outer, boundary, medium, tuple(body for _, body in named))
+    obj = TwinObject(outer, boundary, medium, tuple(body for _, body in named))
+    require_places(obj)
+    return obj
+
+
+def rounding(obj: TwinObject) -> tuple[float, float, float]:
+    """What single precision does to places: a step at the object's farthest coordinate as a share of the shortest free
+    path; that coordinate in mm; and the largest sigma_t in 1/mm.
+    """
+    own = [max(body.medium.sigma_t) for body in obj.inside if isinstance(body.medium, OwnMedium)]
+    sigma_t, reach = max(float(obj.medium.sigma_t.max()), *own, 0.0), float(np.abs(obj.mesh.bounds).max())
+    return sigma_t * float(np.spacing(np.float32(reach))), reach, sigma_t
+
+
+def require_places(obj: TwinObject) -> None:
+    """Raises: InputError where places are rounded to so much of a free path that light is wrong."""
+    share, reach, sigma_t = rounding(obj)
+    if share > MOST_ROUNDING:
+        raise InputError(
+            f"too dense for an object that reaches {reach:.0f} mm from the origin: single precision cannot place light",
+            key="object.medium.sigma_t_per_mm", value=round(sigma_t, 3),
+            allowed=f"up to {sigma_t * MOST_ROUNDING / share:.2g} there",
+            remedy="lower it, or take a smaller object around the origin",
+        )  # fmt: skip
 
 
 def build_scan(scene: Scene, mesh: trimesh.Trimesh) -> trimesh.Trimesh:

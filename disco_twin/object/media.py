@@ -18,12 +18,19 @@ from numpy.typing import ArrayLike, NDArray
 from disco_twin.object.features import coverage
 from disco_twin.object.voxels import Voxels, read_voxels
 from disco_twin.scene.materials import measured
-from disco_twin.scene.object_schema import Feature, Grid, HollowCore, Homogeneous, MediumConfig
+from disco_twin.scene.object_schema import (
+    MOST_G,
+    MOST_SIGMA_T,
+    Feature,
+    Grid,
+    HollowCore,
+    Homogeneous,
+    MediumConfig,
+)
 from hw.base.arrays import F32, F64
 from hw.base.errors import InputError
 
 KEY = "object.medium"
-MOST_G = 0.999  # of a voxel; beyond, single precision cannot tell a direction from another
 MOST_CELLS = 30_000_000  # 360 MB a wavelength while the medium is built
 
 
@@ -82,7 +89,7 @@ def _base(config: MediumConfig, mesh: trimesh.Trimesh, wavelengths_nm: Sequence[
 
 def _grid(base: Grid, mesh: trimesh.Trimesh, lasers: int, g: tuple[float, ...]) -> Medium:
     key = f"{KEY}.base"
-    density = read_voxels(base.sigma_t_file, lasers, f"{key}.sigma_t_file")
+    density = read_voxels(base.sigma_t_file, lasers, f"{key}.sigma_t_file", MOST_SIGMA_T)
     albedo: NDArray[np.floating]
     if base.albedo_file is not None:
         albedo = _beside(density, base.albedo_file, lasers, "albedo", 0.0)

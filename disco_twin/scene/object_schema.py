@@ -17,10 +17,25 @@ from hw.base.config import NearbyFile, Strict
 from pipeline.geometry.nominal_rig import Point, Positive
 
 Share = Annotated[float, Field(ge=0, le=1)]
-Coefficient = Annotated[float, Field(ge=0, le=1e4)]
+MOST_SIGMA_T = 1e4  # 1/mm
+Coefficient = Annotated[float, Field(ge=0, le=MOST_SIGMA_T)]
 PerWavelength = Coefficient | tuple[Coefficient, ...]  # one value for all lasers, or one a laser
-Albedo = Share | tuple[Share, ...]
-Asymmetry = Annotated[float, Field(gt=-1, lt=1)]
+MOST_G = 0.999  # beyond, single precision cannot tell a direction from another
+MOST_ALBEDO = 1 - 1e-6  # below 1: single precision holds what is absorbed in steps of 6e-8
+
+
+def _told_apart(albedo: float) -> float:
+    if MOST_ALBEDO < albedo < 1:
+        raise ValueError(
+            f"an albedo so near to 1 cannot be told from others (allowed: 0 to {MOST_ALBEDO:.7g}, and 1); take 1, or "
+            f"{MOST_ALBEDO:.7g}"
+        )
+    return albedo
+
+
+OneAlbedo = Annotated[Share, AfterValidator(_told_apart)]
+Albedo = OneAlbedo | tuple[OneAlbedo, ...]
+Asymmetry = Annotated[float, Field(ge=-MOST_G, le=MOST_G)]
 
 
 # ---------------------------------------------------------------- boundary

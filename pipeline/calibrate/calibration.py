@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import trimesh
-from pydantic import Field
+from pydantic import AfterValidator, Field, model_validator
 
 from hw.base.arrays import F64
 from hw.base.config import Strict, as_table, read_json
@@ -29,9 +29,30 @@ from pipeline.geometry.nominal_rig import RigConfig
 from pipeline.geometry.projector import TwoMirrorProjector
 
 NotNegative = Annotated[float, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0, le=1e9)]
 Error = NotNegative | None  # one standard deviation; None: not measured
 Errors3 = tuple[NotNegative, NotNegative, NotNegative] | None  # the same along x, y, z of the device's frame
 Errors2 = tuple[NotNegative, NotNegative] | None
+Pixels = Annotated[int, Field(ge=1, le=65536)]
+Place = Annotated[float, Field(ge=-1e6, le=1e6)]
+Factor = Annotated[float, Field(ge=1e-6, le=1e6)]
+FullAngle = Annotated[float, Field(gt=0, lt=np.pi)]
+WIDEST = 20.0  # image's width over the focal length
+ORTHOGONAL = 1e-6  # by which a rotation may miss
+
+
+def _rigid(pose: Pose) -> Pose:
+    matrix = np.array(pose)
+    turn = matrix[:3, :3]
+    off = float(np.abs(turn @ turn.T - np.eye(3)).max()) if np.abs(turn).max() < 2 else np.inf
+    if off > ORTHOGONAL or np.linalg.det(turn) < 0 or (matrix[3] != [0, 0, 0, 1]).any():
+        raise ValueError("is no rigid motion: a rotation, a shift in mm, and the last row 0 0 0 1")
+    if np.abs(matrix[:3, 3]).max() > 1e6:
+        raise ValueError("is a shift of more than a kilometre")
+    return pose
+
+
+RigidPose = Annotated[Pose, AfterValidator(_rigid)]
 
 
 class ViewCalibration(Strict):
@@ -43,18 +64,36 @@ class ViewCalibration(Strict):
 
     camera: str
     angle_rad: float
-    width: int
-    height: int
-    focal_px: tuple[float, float]
-    centre_px: tuple[float, float]
+    width: Pixels
+    height: Pixels
+    focal_px: tuple[Positive, Positive]
+    centre_px: tuple[Place, Place]
     distortion: tuple[float, float, float, float, float]
-    object_to_camera: Pose
+    object_to_camera: RigidPose
     focal_error_px: Error = None
     centre_error_px: Errors2 = None
     rotation_error_rad: Errors3 = None
     translation_error_mm: Errors3 = None
-    radiance_factor: tuple[Annotated[float, Field(gt=0)], ...] = ()
+    radiance_factor: tuple[Factor, ...] = ()
     radiance_factor_error: tuple[NotNegative, ...] = ()
+
+    @model_validator(mode="after")
+    def _has_rays(self) -> Self:
+        if max(self.width, self.height) > WIDEST * min(self.focal_px):
+            raise ValueError(f"focal_px is below a {WIDEST:g}th of the image")
+        far = [abs(c - size / 2) > size for c, size in zip(self.centre_px, (self.width, self.height), strict=True)]
+        if any(far):
+            raise ValueError("centre_px is a whole image away from the image's middle")
+        if any(self.distortion):
+            focal, centre = np.array(self.focal_px), np.array(self.centre_px)
+            distortion = np.array(self.distortion)
+            camera = PinholeCamera(self.width, self.height, focal, centre, distortion, np.eye(4))
+            x, y = np.linspace(0, self.width, 3), np.linspace(0, self.height, 3)
+            with np.errstate(all="ignore"):
+                ahead = camera.ahead(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+            if not (np.abs(ahead) <= WIDEST).all():  # nor NaN
+                raise ValueError("distortion cannot be undone at the image's corners")
+        return self
 
     @classmethod
     def of(cls, name: str, angle_rad: float, camera: PinholeCamera, **measured: Any) -> Self:
@@ -71,11 +110,11 @@ class ProjectorCalibration(Strict):
     """The projector at one turntable angle; its pose is relative to the object, which turns."""
 
     angle_rad: float
-    steps: int
-    full_angle_rad: tuple[float, float]
-    separation_mm: float
-    beam_diameter_mm: float
-    object_to_projector: Pose
+    steps: Annotated[int, Field(ge=2, le=65536)]
+    full_angle_rad: tuple[FullAngle, FullAngle]
+    separation_mm: Annotated[float, Field(ge=0, le=1e4)]
+    beam_diameter_mm: Annotated[float, Field(gt=0, le=1e3)]
+    object_to_projector: RigidPose
     rotation_error_rad: Errors3 = None
     translation_error_mm: Errors3 = None
     full_angle_error_rad: Errors2 = None
@@ -93,15 +132,15 @@ class ProjectorCalibration(Strict):
 class LaserCalibration(Strict):
     """Mean power at the object; the power during one image is the photodiode's reading in the stream."""
 
-    wavelength_nm: float
-    power_w: Annotated[float, Field(gt=0)]
+    wavelength_nm: Positive
+    power_w: Annotated[float, Field(gt=0, le=1e3)]
     power_error_w: Error = None
 
 
 class ScanCalibration(Strict):
     """By how much the scan is moved along its vertex normals, outward, mm by vertex, and what remains unknown of it."""
 
-    displacement_mm: tuple[float, ...]
+    displacement_mm: tuple[Place, ...]
     error_mm: tuple[NotNegative, ...]
 
 
@@ -117,8 +156,24 @@ class Calibration(Strict):
     projectors: Annotated[tuple[ProjectorCalibration, ...], Field(min_length=1)]  # one per turntable angle
     lasers: Annotated[tuple[LaserCalibration, ...], Field(min_length=1)]
     sensor: Annotated[Sensor, as_table(Sensor)]
-    vignetting_exponent: float = 4.0
+    vignetting_exponent: Annotated[float, Field(ge=0, le=8)] = 4.0
     scan: ScanCalibration | None = None
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        angles, lasers = len(self.projectors), len(self.lasers)
+        if len(self.views) % angles:
+            raise ValueError(f"{len(self.views)} views are not as many for each of {angles} angles")
+        if len(self.sensor.responsivity) != lasers:
+            raise ValueError(f"sensor.responsivity has {len(self.sensor.responsivity)} values for {lasers} lasers")
+        if any(len(v.radiance_factor) not in (0, lasers) for v in self.views):
+            raise ValueError(f"radiance_factor needs {lasers} values, one a laser, or none")
+        if not self.sensor.offset_dn < self.sensor.saturation_dn:
+            raise ValueError(f"sensor.offset_dn is not below full scale, {self.sensor.saturation_dn}")
+        response = np.array(self.sensor.response)
+        if len(response) and (len(response) < 2 or response[0] or response[-1] != 1 or (np.diff(response) <= 0).any()):
+            raise ValueError("sensor.response does not rise from 0 to 1")
+        return self
 
     def calibrated(self, scan: trimesh.Trimesh) -> trimesh.Trimesh:
         """The scan with its vertices where the calibration found them, numbered as before.

@@ -27,6 +27,7 @@ LEAST_BOARDS = 6
 WINDOW = 4  # pixels around a corner that its position is fitted to
 PARTS = 4  # of a pixel, per axis, that a corner's model is averaged over
 PART_BLUR = 12**-0.5 / PARTS  # standard deviation of a part's own box, in pixels
+LEAST_WIDTH = 0.02  # of a board's corners in the image, across as a share of along: else they lie on a line
 OUTLIER = 4.0  # a board whose corners are off by this many times the median board's is not used
 
 
@@ -126,7 +127,7 @@ def fit_intrinsics(corners: Sequence[F64 | None], board: F64, nominal: PinholeCa
     The covariance is taken from the boards' scatter where that is larger than the corners': corners of one board err
     together.
 
-    Raises: DiscoError where fewer than `LEAST_BOARDS` boards were found.
+    Raises: DiscoError where fewer than `LEAST_BOARDS` boards were found, or the fit does not converge.
     """
     seen = {i: c for i, c in enumerate(corners) if c is not None}
     if len(seen) < LEAST_BOARDS:
@@ -193,7 +194,9 @@ class _Boards:
             rest = self.residual(x)
             noise = max(float(np.sqrt(rest @ rest / max(len(rest) - len(x), 1))), 1e-9)
             sigma[:LENS] = tolerance / noise
-            x = minimise(self.residual, x, Prior.independent(mean, sigma), self.jacobian).value
+            found = minimise(self.residual, x, Prior.independent(mean, sigma), self.jacobian)
+            found.ended.require("the lens's fit", "photograph the boards again, sharp and all of each in sight")
+            x = found.value
         rest = self.residual(x)
         weight = np.full(len(rest), max(len(rest) - len(x), 1) / max(float(rest @ rest), 1e-18))
         sigma[:LENS] = tolerance
@@ -209,7 +212,10 @@ def _matrices(lens: F64, nominal: PinholeCamera) -> tuple[F64, F64]:
 def _pose_of(points: F64, board: F64, lens: F64, nominal: PinholeCamera) -> F64:
     """(6,) rotation vector and translation of a board. Raises: DiscoError where its corners make no plane."""
     matrix, distortion = _matrices(lens, nominal)
-    ok, rotation, shift = cv2.solvePnP(board, points - 0.5, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
+    extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if np.isfinite(points).all() else np.zeros(2)
+    ok = extent[1] > LEAST_WIDTH * extent[0]
+    if ok:
+        ok, rotation, shift = cv2.solvePnP(board, points - 0.5, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
     if not ok:
         raise DiscoError("a chessboard's pose cannot be found from its corners. Remedy: photograph the board again, "
                          "all of it in sight")  # fmt: skip

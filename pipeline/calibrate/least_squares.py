@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from hw.base.arrays import F64, I64
-from hw.base.errors import DiscoError
+from hw.base.outcome import CONVERGED, Ended, Outcome, Unsolved
 
 log = logging.getLogger(__name__)
 
@@ -70,13 +70,17 @@ SQUARES = Huber(np.inf)
 
 @dataclass(frozen=True)
 class Linearised:
-    """K residuals f (model less measurement) at the unknowns' `value`, their (K, P) Jacobian, and (K,) weights."""
+    """K residuals f (model less measurement) at the unknowns' `value`, their (K, P) Jacobian, and (K,) weights.
+
+    ended: how the iteration ended that led here
+    """
 
     value: F64
     residual: F64
     jacobian: F64
     weight: F64
     prior: Prior
+    ended: Ended = CONVERGED
 
     @cached_property
     def information(self) -> F64:
@@ -90,11 +94,11 @@ class Linearised:
 
     @property
     def covariance(self) -> F64:
-        """(P, P) inverse of `precision`. Raises: DiscoError where an unknown is free, or a value not finite."""
+        """(P, P) inverse of `precision`. Raises: Unsolved where an unknown is free, or a value not finite."""
         return _solved(self.precision, np.eye(len(self.value)))
 
     def step(self) -> F64:
-        """(P,) to the minimum of the linearised sum (Gauss and Newton). Raises: DiscoError as `covariance`."""
+        """(P,) to the minimum of the linearised sum (Gauss and Newton). Raises: Unsolved as `covariance`."""
         pull = self.prior.precision @ (self.value - self.prior.mean)
         return -_solved(self.precision, self.jacobian.T @ (self.weight * self.residual) + pull)
 
@@ -126,7 +130,8 @@ def minimise(
     residual: (P,) unknowns -> (K,); jacobian: unknowns -> (K, P), otherwise by central differences; loss: of the
     residuals, not of the prior
 
-    Raises: DiscoError where residuals at the start, or derivatives, are not finite.
+    What is returned says how it `ended`: stopped, it is for the caller to use or to refuse. Raises: Unsolved where
+    residuals at the start, or derivatives, are not finite.
     """
     derivative = jacobian or partial(_differences, residual)
     values, vectors = np.linalg.eigh(prior.precision)
@@ -148,11 +153,11 @@ def minimise(
     given: Any = rho  # scipy's stubs expect more of it than scipy
     _finite(rows(start))
     found = least_squares(rows, start, derivatives, loss=given, x_scale="jac", ftol=END, xtol=END, gtol=END)
-    if not found.success:
-        log.warning("a fit of %d unknowns was stopped after %d steps, before it converged", len(start), found.nfev)
+    ended = Ended(Outcome.CONVERGED if found.success else Outcome.STOPPED, int(found.nfev))
+    ended.warn(log, f"a fit of {len(start)} unknowns")
     x = np.asarray(found.x, np.float64)
     misses = residual(x)
-    return Linearised(x, misses, derivative(x), loss.weight(misses), prior)
+    return Linearised(x, misses, derivative(x), loss.weight(misses), prior, ended)
 
 
 def likeliest(x: F64, cost: F64) -> tuple[float, float]:
@@ -160,7 +165,7 @@ def likeliest(x: F64, cost: F64) -> tuple[float, float]:
 
     x: (n,) equally spaced values of an unknown that were all tried, three or more. At an end of them, and where costs
     do not bend upward, the lowest value itself and the error that the steeper rise beside it shows; never more than the
-    range that was tried. Raises: DiscoError for costs that are not finite.
+    range that was tried. Raises: Unsolved for costs that are not finite.
     """
     _finite(cost)
     k, step, most = int(np.argmin(cost)), x[1] - x[0], x[-1] - x[0]
@@ -174,9 +179,9 @@ def likeliest(x: F64, cost: F64) -> tuple[float, float]:
 
 
 def _finite(values: F64) -> F64:
-    """The same. Raises: DiscoError where one is not finite."""
+    """The same. Raises: Unsolved where one is not finite."""
     if not np.isfinite(values).all():
-        raise DiscoError("a fit meets values that are not finite. Remedy: check what was measured, and the nominal rig")
+        raise Unsolved("a fit", Outcome.OUT_OF_RANGE)
     return values
 
 
@@ -184,7 +189,7 @@ def _solved(matrix: F64, right: F64) -> F64:
     try:
         return _finite(np.asarray(np.linalg.solve(matrix, right), np.float64))
     except np.linalg.LinAlgError as error:
-        raise DiscoError("a fit's measurements leave unknowns free. Remedy: measure more, or more varied") from error
+        raise Unsolved("a fit", Outcome.SINGULAR) from error
 
 
 def _differences(residual: Callable[[F64], F64], x: F64) -> F64:

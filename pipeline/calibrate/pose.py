@@ -7,6 +7,7 @@ the photographed silhouette from centimetres and ten degrees away, a fine one fi
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -17,6 +18,7 @@ from scipy import ndimage
 from scipy.linalg import block_diag
 
 from hw.base.arrays import F64, I64, Bool
+from hw.base.outcome import Ended, Outcome
 from pipeline.calibrate.edges import Edges
 from pipeline.calibrate.least_squares import Huber, Linearised
 from pipeline.calibrate.outline import outline, signed_distance
@@ -25,6 +27,8 @@ from pipeline.calibrate.scan_fit import ScanFit, fit_scan
 from pipeline.calibrate.sweep import LENS, Sweep, lens_rows, place_prior, pose_jacobian
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.silhouette import mesh_mask, object_mask
+
+log = logging.getLogger(__name__)
 
 UNDETERMINED_RAD, UNDETERMINED_MM = np.deg2rad(1.0), 5.0  # a direction that is known no better is stated as open
 COARSE_STEPS, FINE_STEPS, EXACT_STEPS = 25, 5, 2
@@ -165,6 +169,8 @@ def _fine(
         fit = Linearised(total, -edges.away, edges.jacobian, weight / variance, prior)
         step = fit.step()
         sweep, total = sweep.moved(step), total + step
+    if (np.abs(step) > np.sqrt(np.diag(fit.covariance))).any():
+        Ended(Outcome.STOPPED, FINE_STEPS).warn(log, "the fit of poses to edges")
     joint, scanned = fit_scan(sweep, images, mesh), mesh
     if joint.scan.because:
         fit = replace(fit, residual=np.asarray(edges.jacobian @ step - edges.away, np.float64))

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from hw.base.arrays import F64, I64, Bool
 from hw.base.errors import DiscoError
+from hw.base.outcome import Outcome, Unsolved
 from pipeline.calibrate.least_squares import Huber, Prior, minimise
 from pipeline.geometry.projector import TwoMirrorProjector
 
@@ -28,6 +29,7 @@ SHIFT_MM = 1.0  # by which a spot's peak may move, per unit of a direction's sin
 HUBER = 2.0  # in units of the spots' own scatter
 GATE = 5.0  # beyond this many scatters a spot is false
 STEPS = 15
+SETTLED = 0.01  # relative change of the spots' scatter, after so many steps, with which a fit still serves
 
 
 def dlt(points: F64, steps: F64) -> F64:
@@ -56,8 +58,10 @@ def _normaliser(points: F64) -> F64:
 def true_spots(points: F64, steps: F64, tolerance: float, rng: np.random.Generator) -> Bool:
     """(N,) spots that one projection matrix fits, by robust DLT; `tolerance` in steps separates them from false ones.
 
-    Raises: DiscoError where too few spots agree, or nearly coplanar ones do.
+    Raises: DiscoError where too few spots agree, nearly coplanar ones do, or one is not finite.
     """
+    if not (np.isfinite(points).all() and np.isfinite(steps).all()):
+        raise Unsolved("the search for the projector's spots", Outcome.OUT_OF_RANGE)
     require_depth(points)
     best: Bool = np.zeros(len(points), bool)
     for _ in range(DRAWS):
@@ -187,7 +191,7 @@ def refine(
 
     start: the nominal projector, points: (N, 3) mm, all in one frame; normals, to_eye: (N, 3) unit; group: (N,) spots
     of one group err together (default: each for itself); place: (6, 6) covariance of the nominal pose (default: of a
-    projector set up in the points' own frame). Raises: DiscoError as `minimise`.
+    projector set up in the points' own frame). Raises: Unsolved as `minimise`, and where it does not converge.
     """
     nominal = start.full_angle_rad
     known = StepSize(nominal, np.diag((nominal * ANGLE_SHARE) ** 2)) if size is None else size
@@ -205,6 +209,10 @@ def refine(
         value = fit.value
         if abs(scatter - before) < 1e-4 * scatter:
             break
+    else:
+        if abs(scatter - before) > SETTLED * scatter:
+            raise Unsolved("the projector's fit", Outcome.STOPPED, STEPS)
+    fit.ended.require("the projector's fit")
     inverse = fit.covariance
     covariance = inverse @ (fit.scatter(np.repeat(group, 2)) + prior.precision) @ inverse
     kept = fit.weight[::2] > 0

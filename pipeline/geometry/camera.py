@@ -95,7 +95,7 @@ class PinholeCamera:
         return distort(xy, self.distortion)
 
     def undistort(self, xy: F64) -> F64:
-        """Inverse of `distort` by Newton's method; exact to 1e-12 where it is invertible."""
+        """Inverse of `distort` by Newton's method; exact to 1e-12 where it is invertible, NaN where it is not."""
         if not self.distortion.any():
             return xy
         out = xy.copy()
@@ -107,6 +107,10 @@ class PinholeCamera:
             determinant, (x, y) = along * down - across**2, residual.T
             out[:, 0] -= (down * x - across * y) / determinant
             out[:, 1] -= (along * y - across * x) / determinant
+        else:
+            with np.errstate(over="ignore", invalid="ignore"):
+                found = np.abs(self.distort(out) - xy).max(axis=1) < 1e-9
+            out[~found] = np.nan
         return out
 
     def project(self, points: F64) -> tuple[F64, F64]:

@@ -71,7 +71,8 @@ def _global(term: Term, mesh: trimesh.Trimesh, cut: Truncation) -> FactorisedTer
     entries, couplings = (np.stack(column) for column in zip(*parts, strict=True))
     errors = []
     for one, basis, (values, coupling) in zip(term.reflectance, bases, parts, strict=True):
-        errors.append(_norm_bound(_left(one, Kernel(pair, values, patch, basis, coupling), root), len(root)))
+        left = _norm_bound(_left(one, Kernel(pair, values, patch, basis, coupling), root), len(root))
+        errors.append(left + _rounding(one, root))
     plain = FactorisedTerm(pair, entries, patch, bases, couplings, np.array(errors))
     if term.tilt is None or term.tilt_distance is None:
         return plain
@@ -178,6 +179,14 @@ def _left(matrix: F32, kernel: Kernel, root: F64) -> Callable[[F64], F64]:
         return np.asarray(root[:, None] * (matrix @ scaled.astype(np.float32) - kernel(scaled.T).T), np.float64)
 
     return left
+
+
+def _rounding(matrix: F32, root: F64) -> float:
+    """By how much sums in single precision are off, as an operator's norm: next to nothing is left of an R_d that is
+    all near its diagonal.
+    """
+    sums = np.asarray(matrix, np.float64) @ root**2  # of a matrix without negative entries: its norm is no more
+    return float(np.finfo(np.float32).eps * sums.max())
 
 
 def _norm_bound(operator: Callable[[F64], F64], size: int) -> float:

@@ -22,6 +22,12 @@ class LambertianTerm(Term):
 
     albedo: Annotated[F32, Axes("laser vertex", "1")]
 
+    def check(self, lasers: int, vertices: int) -> None:
+        """Raises: ValueError as every term, and for an albedo below 0."""
+        super().check(lasers, vertices)
+        if self.albedo.min(initial=0.0) < 0:
+            raise ValueError(f"{self.kind}.albedo: holds values below 0")
+
     def image(self, light: LightOnMesh, view: ViewOfMesh) -> F32:
         """Radiosity albedo * flux / area, linear on the faces."""
         return view.image(light.flux * self.albedo / RayMesh.of(light.mesh).vertex_areas)

@@ -82,8 +82,8 @@ class GlobalTerm(RadiosityTerm):
         return WeakKeyDictionary()
 
     def check(self, lasers: int, vertices: int) -> None:
-        """Raises: ValueError as every term, for a matrix that is not symmetric to float32's rounding, and for a tilt's
-        slopes without distances in order.
+        """Raises: ValueError as every term, for a matrix that is not symmetric to float32's rounding, a variance
+        below 0, and a tilt's slopes without distances in order.
         """
         super().check(lasers, vertices)
         distance = self.tilt_distance
@@ -97,6 +97,8 @@ class GlobalTerm(RadiosityTerm):
             if "vertex_out" not in self.axes()[name].names:
                 continue
             other = array.swapaxes(-1, -2)
+            if name == "variance" and array.min(initial=0.0) < 0:
+                raise ValueError(f"{self.kind}.{name}: holds values below 0")
             if not np.array_equal(array, other) and not np.allclose(array, other, 1e-4, 1e-6 * float(array.max())):
                 raise ValueError(f"{self.kind}.{name}: is not symmetric")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import trimesh
@@ -17,6 +17,7 @@ from hw.base.errors import InputError
 from hw.base.files import load_arrays, save_arrays
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.fresnel import Boundary
+from pipeline.geometry.mesh import RayMesh
 from pipeline.model.factorised import FactorisedTerm
 from pipeline.model.lambertian import LambertianTerm
 from pipeline.model.reflectance import GlobalTerm
@@ -28,6 +29,7 @@ FORMAT_VERSION = 2
 WITHOUT = "without "  # in a provenance, before the name of what a method left out; the value is the reason
 KINDS: Mapping[str, type[Term]] = {term.kind: term for term in (GlobalTerm, LambertianTerm, FactorisedTerm)}
 REMEDY = "reconstruct again with this version"
+FARTHEST_MM = 1e6
 
 
 @dataclass(frozen=True)
@@ -161,13 +163,41 @@ class RelightableModel:
             terms = tuple(KINDS[kind](**part) for kind, part in zip(kinds, parts, strict=True))
             if head["units"] != _units(terms):
                 raise InputError("unknown units", file=path, key="units", value=head["units"], remedy=REMEDY)
-            if not 0 <= arrays["faces"].min() <= arrays["faces"].max() < len(arrays["vertices"]):
-                raise ValueError("faces and vertices do not fit")
-            mesh = trimesh.Trimesh(arrays["vertices"], arrays["faces"], process=False)
-            boundary = Boundary(float(b["eta"]), tuple(b["cosines"]), tuple(b["ratio"]))
+            mesh = _surface(arrays["vertices"], arrays["faces"])
+            boundary = _boundary(b["eta"], b["cosines"], b["ratio"])
             return cls(mesh, boundary, terms, head["provenance"])
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(f"is damaged, or no model ({in_words(error)})", file=path, remedy=REMEDY) from error
+
+
+def _surface(vertices: NDArray[Any], faces: NDArray[Any]) -> trimesh.Trimesh:
+    """Raises: ValueError for arrays that are no surface with an area."""
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind != "f" or not np.isfinite(vertices).all():
+        raise ValueError("vertices are not (V, 3) finite numbers")
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu" or not len(faces):
+        raise ValueError("faces are not (F, 3) whole numbers")
+    if not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise ValueError("faces and vertices do not fit")
+    if np.abs(vertices).max() > FARTHEST_MM:
+        raise ValueError(f"a vertex is more than {FARTHEST_MM:g} mm away")
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    if not (RayMesh.of(mesh).vertex_areas > 0).all():
+        raise ValueError("a vertex has no area around it")
+    return mesh
+
+
+def _boundary(eta: Any, cosines: Any, ratio: Any) -> Boundary:
+    """Raises: ValueError, TypeError for what is no curve of a boundary."""
+    at, values = np.array(cosines, np.float64), np.array(ratio, np.float64)
+    if not 1 <= float(eta) <= 10:
+        raise ValueError("boundary.eta is not 1 to 10")
+    if at.ndim != 1 or at.shape != values.shape or not at.size:
+        raise ValueError("boundary.cosines and boundary.ratio are not two equal lists")
+    if not ((at >= 0) & (at <= 1)).all() or (np.diff(at) <= 0).any():
+        raise ValueError("boundary.cosines do not rise from 0 to 1")
+    if not ((values >= 0) & (values <= 1e3)).all():
+        raise ValueError("boundary.ratio is not 0 to 1000")
+    return Boundary(float(eta), tuple(map(float, at)), tuple(map(float, values)))
 
 
 def _same(one: trimesh.Trimesh, other: trimesh.Trimesh) -> bool:

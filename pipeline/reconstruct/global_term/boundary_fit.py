@@ -36,6 +36,7 @@ LINE_SPREAD = 0.1  # of the line's slope: what an index of 1.3 to 1.7, and light
 NORMAL_ERROR = 0.03  # rad, that the scan's normals have in common at one view cosine
 BIN_ERROR = 0.02  # relative, of a bin: what the model leaves of the sums
 OUTLIER = Huber(2.0)
+WORST = 1e12  # cost of a fit that did not converge
 CURVE = np.concatenate([[0.0], np.geomspace(0.002, 0.05, 8), np.linspace(0.1, 1.0, 19)])  # cosines of its corners
 
 
@@ -112,6 +113,8 @@ def rough_boundary(eta: float, cosines: F64, ratio: F64) -> Boundary:
     def fitted(log_alpha: float) -> tuple[F64, float]:
         rough = np.log(rough_transmittance(c, eta, float(np.exp(log_alpha))) / transmittance(c, eta))
         found = minimise(lambda x: (line @ x + rough - measured) / sigma, np.zeros(2), prior, loss=OUTLIER)
+        if not found.ended.converged:  # such an alpha is not the likeliest
+            return found.value, WORST
         cost = OUTLIER.cost(found.residual).sum() + (found.value[1] / LINE_SPREAD) ** 2
         return found.value, float(cost + ((log_alpha - USUAL) / USUAL_SPREAD) ** 2)
 

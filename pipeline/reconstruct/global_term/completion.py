@@ -22,6 +22,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from scipy.special import chdtri  # scipy.stats takes most of a second to import
 
 from hw.base.arrays import F32, F64, Bool
+from hw.base.outcome import Outcome, Unsolved
 from pipeline.geometry.mesh import RayMesh
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import WITHOUT, RelightableModel
@@ -43,6 +44,7 @@ BOTH_ENDS = 2 * ANGULAR**2  # relative variance of any entry that directions lea
 ROUNDS = 2  # of Gauss-Newton, for each of as many fits of the profile
 TOLERANCE = 1e-3  # of conjugate gradients: what is left stays below the stated errors (docs/decisions/0083)
 MOST_STEPS = 300
+NEARLY = 10 * TOLERANCE  # with which a field still serves
 MOST_HARMONICS = 500
 TILT_BY_CHANCE = 1e-3  # probability with which samples without a tilt show one
 
@@ -80,7 +82,8 @@ class SymmetricField:
     def solve(self, target: F64, weight: F64, scale: F64, start: F32) -> F32:
         """Y that minimises sum weight (target - scale * field)^2 + Y penalty Y, by preconditioned conjugate gradients.
 
-        target, weight, scale: (S, V); weight is 0 where nothing was observed. start: (n, n) first guess.
+        target, weight, scale: (S, V); weight is 0 where nothing was observed. start: (n, n) first guess. Raises:
+        Unsolved where after `MOST_STEPS` too much is left.
         """
         w = (weight * scale**2).astype(np.float32)
         # Preconditioned from both sides, so that the residual is judged as the preconditioner weighs it.
@@ -94,6 +97,9 @@ class SymmetricField:
         right = half * self.gather((weight * scale * target).astype(np.float32))
         y, steps = cg(system, right.ravel(), (start / half).ravel(), rtol=TOLERANCE, maxiter=MOST_STEPS)
         if steps:
+            left = float(np.linalg.norm(apply(y) - right.ravel()) / np.linalg.norm(right))
+            if not left < NEARLY:
+                raise Unsolved("the completion's smooth field", Outcome.STOPPED, steps)
             log.warning("completion: conjugate gradients stopped after %d steps", steps)
         return np.asarray(half * y.reshape(half.shape))
 

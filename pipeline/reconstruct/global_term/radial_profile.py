@@ -16,6 +16,8 @@ from scipy.interpolate import BSpline
 from scipy.linalg import block_diag
 
 from hw.base.arrays import F64
+from hw.base.errors import DiscoError
+from hw.base.outcome import Outcome, Unsolved
 from pipeline.calibrate.least_squares import Linearised, Prior
 from pipeline.model.tilt import TiltLaw
 from pipeline.reconstruct.samples.distances import Pairs
@@ -26,6 +28,7 @@ log = logging.getLogger(__name__)
 
 ITERATIONS = 12
 TILT_EDGES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # where the tilt's slopes stand
+TOO_MUCH = 1.0  # change with which it is no fit
 ENOUGH = 0.1 * ANGULAR  # change of any sample's logarithm at which the fit ends
 
 
@@ -56,7 +59,11 @@ def _knots(edge: float, largest: float) -> F64:
 
 
 def _start(profile: Profile, measured: LaserSamples, distance: F64) -> F64:
-    """Coefficients through the logarithms of means over bins of distance."""
+    """Coefficients through the logarithms of means over bins of distance. Raises: DiscoError where all is dark."""
+    if not (measured.observed & (measured.value > 0)).any():
+        seen = int(measured.observed.sum())
+        remedy = "more light, longer exposures, spots that the cameras see"
+        raise DiscoError(f"no light of a spot was seen: of {seen} samples none is above 0. Remedy: {remedy}")
     edges = np.quantile(distance[measured.observed], np.linspace(0, 1, 41))
     bin_of = np.clip(np.searchsorted(edges, distance) - 1, 0, 39)
     at, level = [], []
@@ -65,6 +72,11 @@ def _start(profile: Profile, measured: LaserSamples, distance: F64) -> F64:
         if chosen.any() and measured.value[chosen].mean() > 0:
             at.append(distance[chosen].mean())
             level.append(np.log(measured.value[chosen].mean()))
+    if not at:
+        raise DiscoError(
+            "no light of the spots stands out of the noise: at no distance is the samples' mean above 0. Remedy: more "
+            "light, or longer exposures"
+        )
     basis = profile.basis(np.array(at))
     bend = np.diff(np.eye(basis.shape[1]), 2, axis=0)
     return np.asarray(np.linalg.solve(basis.T @ basis + 1e-2 * bend.T @ bend, basis.T @ np.array(level)))
@@ -90,6 +102,8 @@ def fit_profile(
     """Fit f and the tilt's slopes so that exp(offset + s tilt) (mean of f over the patches) meets the values.
 
     tilt: (S, V) of the samples; offset: (S, V) or 0; start: a first guess. f is the mean over all directions.
+
+    Raises: DiscoError where all is dark; Unsolved where the fit is far from its end after so many steps.
     """
     knots = _knots(edge, float(pairs.distance.max()) * 1.01)
     if start is None:
@@ -120,6 +134,8 @@ def fit_profile(
         if np.abs(jacobian @ step).max() < ENOUGH:
             break
     else:
+        if not np.abs(jacobian @ step).max() < TOO_MUCH:
+            raise Unsolved("the fit of R_d by distance", Outcome.STOPPED, ITERATIONS, "more spots, or more light")
         log.warning("the profile's fit was stopped after %d steps, before it converged", ITERATIONS)
     # A spot's samples err together: where it lies, the object around it.
     covariance = linear.covariance @ (linear.scatter(np.nonzero(observed)[0]) + prior.precision) @ linear.covariance

@@ -16,9 +16,11 @@ from itertools import product
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.special import log_ndtr  # scipy.stats takes most of a second to import
+from scipy.special import erfcx  # scipy.stats takes most of a second to import
 
 from hw.base.arrays import F64
+from hw.base.errors import InputError
+from hw.base.outcome import Outcome, Unsolved
 from pipeline.reconstruct.global_term.harmonics import Harmonics
 
 log = logging.getLogger(__name__)
@@ -29,6 +31,9 @@ COMMON = (0.02, 0.04, 0.08)  # what the samples of one spot have in common, like
 SHARED, SHARED_RANGE = 0.08, 6.0  # what errors of scan and poses do to totals, and over how many edges alike
 ENOUGH = 1e-4  # relative change of a factor at which the scaling ends
 STEPS = 200
+FAR_ABOVE = 1e4  # deviations
+DARKEST = 1e-6  # share of what arrives that leaves where nothing seems to
+TOO_MUCH = 10.0  # times the light that arrives, in the median column: no noise, but another unit of power
 
 
 @dataclass(frozen=True)
@@ -112,10 +117,17 @@ def steady_totals(
     times the share of what leaves there that leaves for good; exitance_per_flux: Tbar^2, by which sums
     of R_d are what leaves of what arrives; edge: mm; expected: (L, V) logarithms of the totals of a model of the whole
     object, of any level, or None
+
+    Raises: InputError for samples by which far more light leaves than arrives.
     """
     share = reflectance * open_area
     total = share.sum(axis=2)
+    _require_possible(total * exitance_per_flux)
+    dark = total <= 0  # nothing leaves: the neighbours' totals say more
+    total = np.where(dark, 1.0 / exitance_per_flux, total)
     open_deviation = (share * np.sqrt(variance)).sum(axis=2) / total  # errors of a column are alike: they simply add up
+    # More than arrives cannot leave: a column that says so is off by at least as much.
+    excess = np.where(dark, -np.log(DARKEST), np.maximum(np.log(total * exitance_per_flux), 0.0))
     # Errors that neighbours share cannot be told from the object where nothing is known of its totals' shape.
     shape, size = (np.zeros_like(total), 0.0) if expected is None else (expected, SHARED)
     known = np.log(total * exitance_per_flux) - shape
@@ -123,7 +135,7 @@ def steady_totals(
 
     @cache  # for all lengths and deviations
     def seen(laser: int, common: float) -> ObservedField:
-        return ObservedField(basis.functions, open_deviation[laser] ** 2 + common**2)
+        return ObservedField(basis.functions, open_deviation[laser] ** 2 + excess[laser] ** 2 + common**2)
 
     def field(laser: int, choice: tuple[float, float, float]) -> Kriging:
         length, deviation, common = choice
@@ -137,9 +149,24 @@ def steady_totals(
     for laser, own in enumerate(reflectance):
         mean, spread = field(laser, best).posterior(known[laser])
         wanted = np.exp(at_most_zero(mean + shape[laser], np.sqrt(spread))) / exitance_per_flux
-        factor = scaling(own, open_area, wanted)
+        try:
+            factor = scaling(own, open_area, wanted)
+        except Unsolved as why:
+            log.warning("laser %d: %s; its column totals stay as they were", laser, why)
+            factor = np.ones(len(open_area))
         out[laser] = factor[:, None] * own * factor
     return out
+
+
+def _require_possible(leaving: F64) -> None:
+    """leaving: (L, V) of what arrives. Raises: InputError where no noise explains it."""
+    worst = float(np.median(leaving, axis=1).max())
+    if worst > TOO_MUCH:
+        raise InputError(
+            f"the samples give back {worst:.3g} times the light that arrived", key="photodiode_w",
+            allowed=f"up to {TOO_MUCH:g} times, as a median over the surface",
+            remedy="state powers in watts, and the camera's responsivity per W/(mm^2 sr)",
+        )  # fmt: skip
 
 
 def _spectrum(basis: Harmonics, range_mm: float, deviation: float) -> F64:
@@ -150,20 +177,24 @@ def _spectrum(basis: Harmonics, range_mm: float, deviation: float) -> F64:
 
 def at_most_zero(mean: F64, deviation: F64) -> F64:
     """Expectation of a normal variable that is known to be at most 0."""
-    edge = -mean / deviation
-    density = -(edge**2) / 2.0 - np.log(np.sqrt(2 * np.pi))  # its logarithm
-    return np.asarray(mean - deviation * np.exp(density - log_ndtr(edge)))
+    size = np.maximum(deviation, 1e-300)
+    with np.errstate(over="ignore"):  # far below the bound, where nothing is taken off
+        inner = mean - size * np.sqrt(2.0 / np.pi) / erfcx(mean / (np.sqrt(2.0) * size))
+    far = mean > FAR_ABOVE * deviation  # the two cancel there: the tail's first order
+    return np.where(far, -(deviation**2) / np.where(far, mean, 1.0), inner)
 
 
 def scaling(reflectance: F64, area: F64, wanted: F64) -> F64:
     """(V,) g for which g_u sum_v R_uv g_v A_v = wanted_u (Sinkhorn and Knopp 1967, for symmetric matrices).
 
-    reflectance: (V, V) symmetric, positive; area, wanted: (V,)
+    reflectance: (V, V) symmetric, not negative; area, wanted: (V,). A row of zeros keeps its factor. Raises: Unsolved
+    where no factors are found.
     """
     factor = np.ones(len(area))
     for _ in range(STEPS):
-        change = np.sqrt(wanted / (factor * (reflectance @ (factor * area))))
+        total = factor * (reflectance @ (factor * area))
+        change = np.sqrt(np.divide(wanted, total, out=np.ones_like(total), where=total > 0))
         factor *= change
         if np.abs(change - 1).max() < ENOUGH:
-            break
-    return factor
+            return factor
+    raise Unsolved("the scaling of column totals", Outcome.STOPPED, STEPS)
