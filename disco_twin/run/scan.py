@@ -12,6 +12,8 @@ from pipeline.calibrate.projector_fit import LEAST_SPOTS
 from pipeline.plan.visibility import require_in_sight
 from pipeline.records import write_capture_records
 
+LEAST_SCATTERED = 1e-3  # scatterings on a way through the object, below which its light is lost in any noise
+
 
 def write_scan(experiment: Experiment, capture: Path, sensor: Sensor | None = None) -> None:
     """The nominal rig, its sensor (the twin's, unless it is given), the scanned mesh.
@@ -46,13 +48,18 @@ def require_capturable(experiment: Experiment) -> None:
 
 
 def require_scattering(experiment: Experiment) -> None:
-    """Refuse an object in which no light is scattered: nothing of it would come out again. Raises: InputError."""
-    medium = experiment.object.medium
-    dark = [k for k, (t, a) in enumerate(zip(medium.sigma_t, medium.albedo, strict=True)) if not (t * a).any()]
+    """Refuse an object in which next to no light is scattered: nothing of it would come out again.
+
+    Raises: InputError.
+    """
+    medium, size_mm = experiment.object.medium, float(experiment.scan.scale)
+    most = [float((t * a).max()) for t, a in zip(medium.sigma_t, medium.albedo, strict=True)]
+    dark = [k for k, scattering in enumerate(most) if scattering * size_mm < LEAST_SCATTERED]
     if dark:
         nm = ", ".join(f"{experiment.scene.rig.lasers[k].wavelength_nm:g}" for k in dark)
         raise InputError(
-            f"nothing scatters light of {nm} nm in the object: sigma_t times albedo is 0 everywhere",
-            key="object.medium", allowed="more than 0 somewhere",
-            remedy="more sigma_t or albedo, or leave the laser out",
+            f"nothing scatters light of {nm} nm in the object: sigma_t times albedo is "
+            f"{max(most[k] for k in dark):.2g} /mm at most", key="object.medium",
+            allowed=f"{LEAST_SCATTERED / size_mm:.2g} and more somewhere",
+            remedy="more sigma_t (in 1/mm) or albedo, or leave the laser out",
         )  # fmt: skip

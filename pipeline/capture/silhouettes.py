@@ -33,7 +33,7 @@ WHOLE = 0.9  # share of an image that the scan fills at most: beyond, no outline
 SLACK = 0.35  # of the object's size, that it may lie beside its place while the poses are still to be calibrated
 BETTER = 0.5  # of what an overlap lacks, another explanation may leave at most to be the likeliest
 DECISIVE = 0.9  # overlap of another explanation that leaves no doubt
-HOPELESS = 0.4  # overlap below which no calibration finds the poses, as from another object's scan, or in other units
+HOPELESS = 0.2  # overlap below which no calibration finds the poses, as from another object's scan, or in other units
 
 
 @dataclass(frozen=True)

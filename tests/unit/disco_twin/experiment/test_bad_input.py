@@ -110,7 +110,14 @@ def test_too_few_spots_are_refused_before_they_are_taken() -> None:
     require_capturable(sphere(cameras=[CAMERA | {"position_mm": (450, 0, 50)}], spots=3))
 
 
-@pytest.mark.parametrize("base", [{"sigma_t_per_mm": 0.0, "albedo": 0.9}, {"sigma_t_per_mm": 1.0, "albedo": 0.0}])
+@pytest.mark.parametrize(
+    "base",
+    [
+        {"sigma_t_per_mm": 0.0, "albedo": 0.9},
+        {"sigma_t_per_mm": 1.0, "albedo": 0.0},
+        {"sigma_t_per_mm": 1e-6, "albedo": 0.9},
+    ],
+)
 def test_an_object_that_scatters_nothing(base: dict[str, float]) -> None:
     experiment = sphere()
     medium = MediumConfig.model_validate({"base": base | {"kind": "homogeneous"}})
