@@ -14,6 +14,7 @@ from benchmarks.stability.case import Case, Verdict
 
 FAMILIES = (
     "camera",
+    "poses",
     "surface",
     "solvers",
     "calibration",

@@ -32,6 +32,7 @@ log = logging.getLogger(__name__)
 
 UNDETERMINED_RAD, UNDETERMINED_MM = np.deg2rad(1.0), 5.0  # a direction that is known no better is stated as open
 COARSE_STEPS, FINE_STEPS, EXACT_STEPS = 25, 5, 2
+SETTLED_PX = 0.1  # by which edges may move, root mean square, in the last step
 HUBER_COARSE_PX, HUBER_FINE_PX = 3.0, 0.15
 COMMON_EDGE_PX = 0.003  # edges of a camera may be off together by this
 
@@ -169,7 +170,7 @@ def _fine(
         fit = Linearised(total, -edges.away, edges.jacobian, weight / variance, prior)
         step = fit.step()
         sweep, total = sweep.moved(step), total + step
-    if (np.abs(step) > np.sqrt(np.diag(fit.covariance))).any():
+    if np.sqrt(((edges.jacobian @ step) ** 2).mean()) > SETTLED_PX:
         Ended(Outcome.STOPPED, FINE_STEPS).warn(log, "the fit of poses to edges")
     joint, scanned = fit_scan(sweep, images, mesh), mesh
     if joint.scan.because:

@@ -8,6 +8,7 @@ whose covariance is its uncertainty. The Lars III needs none of it.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,7 +17,10 @@ from scipy.interpolate import CubicSpline
 
 from hw.base.arrays import F64, I64, U16
 from hw.base.errors import InputError
+from hw.base.outcome import Ended, Outcome
 from hw.record import Sensor
+
+log = logging.getLogger(__name__)
 
 KNOTS = (np.arange(21) / 20) ** 2  # of the spline, as shares of the full well: dense in the dark, where it bends
 TABLE = 257  # entries of the inverse
@@ -81,6 +85,8 @@ def fit_response(images: Sequence[U16], seconds: Sequence[float], sensor: Sensor
             fit = _Equations.of(seen, time, values, light, sensor, fit.weight if taken >= REWEIGHTED else None)
         else:
             damping *= 10
+    else:  # whether it serves, chi^2 says below
+        Ended(Outcome.STOPPED, STEPS).warn(log, "the fit of the response")
     fit = _Equations.of(seen, time, values, light, sensor)
     _require_cover(time * light[:, None])
     freedom = max(int((fit.weight > 0).sum()) - len(seen) - len(KNOTS) + 2, 1)

@@ -23,6 +23,7 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.optimize import minimize
 
 from hw.base.arrays import F64
+from hw.base.outcome import Ended, Outcome
 from pipeline.calibrate.edges import Edges
 from pipeline.calibrate.least_squares import Huber, Linearised, Prior
 from pipeline.calibrate.scan_error import LENGTHS_MM
@@ -192,6 +193,9 @@ class Evidence:
         options: Any = {"xatol": 0.02, "fatol": 0.02, "maxiter": 80}
         start: Any = np.log([size_mm, edge_px] if surface else [edge_px])
         found = minimize(cost, start, method="Nelder-Mead", options=options)
+        Ended(Outcome.CONVERGED if found.success else Outcome.STOPPED, int(found.nit)).warn(
+            log, "the scan's likelihood"
+        )
         return (*values(found.x), -float(found.fun))
 
     def fit(self, size_mm: float, edge_px: float) -> Linearised:

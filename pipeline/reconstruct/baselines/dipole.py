@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 from scipy.optimize import least_squares
 
 from hw.base.arrays import F64
+from hw.base.outcome import Ended, Outcome
 from pipeline.geometry.fresnel import Boundary
 from pipeline.geometry.mesh import RayMesh
 from pipeline.model.reflectance import GlobalTerm
@@ -15,6 +18,8 @@ from pipeline.reconstruct.global_term.radial_profile import over_directions
 from pipeline.reconstruct.registry import method
 from pipeline.reconstruct.samples.distances import Kernel
 from pipeline.reconstruct.samples.samples import Samples
+
+log = logging.getLogger(__name__)
 
 BINS = 24
 FAINTEST = 1e-3  # bins further below the first are left to noise
@@ -64,6 +69,7 @@ def fit_dipole_laser(samples: Samples, laser: int) -> tuple[float, float]:
         return np.append(np.log(model[use] / seen[use]), ENERGY_WEIGHT * energy)
 
     fit = least_squares(misfit, np.log([1.0, 0.01]), loss="soft_l1", f_scale=0.3, bounds=(np.log(1e-5), np.log(1e3)))
+    Ended(Outcome.CONVERGED if fit.success else Outcome.STOPPED, int(fit.nfev)).warn(log, "the dipole's fit")
     scattering, absorption = np.exp(fit.x)
     return float(scattering), float(absorption)
 

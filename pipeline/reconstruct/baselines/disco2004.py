@@ -15,6 +15,7 @@ from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg
 
 from hw.base.arrays import F32, F64, I64, Bool
+from hw.base.outcome import Ended, Outcome
 from pipeline.geometry.fresnel import Boundary
 from pipeline.geometry.mesh import RayMesh
 from pipeline.model.reflectance import GlobalTerm
@@ -74,8 +75,7 @@ def fill(values: F64, known: Bool, laplacian: sparse.csr_array) -> F64:
     size = half.size
     system = LinearOperator((size, size), lambda x: apply(half * x.reshape(half.shape)).ravel(), dtype=np.float32)
     filled, steps = cg(system, -apply(start.astype(np.float32)).ravel(), rtol=TOLERANCE, maxiter=MOST_STEPS)
-    if steps:
-        log.warning("disco2004: conjugate gradients stopped after %d steps", steps)
+    Ended(Outcome.STOPPED if steps else Outcome.CONVERGED, steps).warn(log, "disco2004's filling")
     return np.asarray(np.where(fixed, start, np.maximum(half * filled.reshape(half.shape), 0.0)), np.float64)
 
 
