@@ -44,7 +44,7 @@ BOTH_ENDS = 2 * ANGULAR**2  # relative variance of any entry that directions lea
 ROUNDS = 2  # of Gauss-Newton, for each of as many fits of the profile
 TOLERANCE = 1e-3  # of conjugate gradients: what is left stays below the stated errors (docs/decisions/0083)
 MOST_STEPS = 300
-NEARLY = 10 * TOLERANCE  # with which a field still serves
+NEARLY = 100 * TOLERANCE  # with which a field still serves
 MOST_HARMONICS = 500
 TILT_BY_CHANCE = 1e-3  # probability with which samples without a tilt show one
 

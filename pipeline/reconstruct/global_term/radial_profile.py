@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 ITERATIONS = 12
 TILT_EDGES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # where the tilt's slopes stand
-TOO_MUCH = 1.0  # change with which it is no fit
+TOO_MUCH = 1.0  # change, root mean square, with which it is no fit
 ENOUGH = 0.1 * ANGULAR  # change of any sample's logarithm at which the fit ends
 
 
@@ -134,7 +134,8 @@ def fit_profile(
         if np.abs(jacobian @ step).max() < ENOUGH:
             break
     else:
-        if not np.abs(jacobian @ step).max() < TOO_MUCH:
+        # By weight: where nothing but noise is seen, a profile may go on falling for ever.
+        if not weight @ (jacobian @ step) ** 2 < TOO_MUCH**2 * weight.sum():
             raise Unsolved("the fit of R_d by distance", Outcome.STOPPED, ITERATIONS, "more spots, or more light")
         log.warning("the profile's fit was stopped after %d steps, before it converged", ITERATIONS)
     # A spot's samples err together: where it lies, the object around it.
