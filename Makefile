@@ -6,7 +6,7 @@ READY := $(VENV)/.installed
 OUT ?= out/quick
 unexport PYTHONDONTWRITEBYTECODE  # containers set it; each of the many processes would compile all that it imports
 
-.PHONY: demo test lint validate install references outside accuracy picture curves soak stability clean
+.PHONY: demo test lint validate install references outside accuracy regression picture curves soak stability clean
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -18,6 +18,7 @@ help:
 	@echo "make references  render the reference images of quick and of the accuracy set that are missing (hours)"
 	@echo "make outside   render the outside references that are missing, by stock Mitsuba (most of an hour of one core)"
 	@echo "make accuracy  the default beside all baselines on objects that nothing was chosen on (most of an hour)"
+	@echo "make regression  the pipeline of now beside its stored scores, on three frozen captures (minutes)"
 	@echo "make soak      20,000 images with faults, kills and resumes: nothing grows, every image is right (minutes)"
 	@echo "make curves    error against seconds of the light's estimators: docs/benchmarks/walk.svg (minutes)"
 	@echo "make stability the stress suite of all numerical kernels: docs/stability.md (minutes)"
@@ -81,6 +82,9 @@ outside: $(READY)
 accuracy: $(READY)
 	$(BIN)/python -m benchmarks accuracy --json docs/benchmarks/accuracy.json
 	$(BIN)/python -m benchmarks.accuracy_table docs/benchmarks/accuracy.json docs/accuracy.md
+
+regression: $(READY)
+	$(BIN)/python -m benchmarks.frozen
 
 picture: $(READY)
 	$(BIN)/python -m benchmarks.readme_picture $(OUT) docs/picture.png

@@ -30,6 +30,7 @@ REGISTRY = {
     "pareto": "benchmarks.pareto",
     "reconstruct": "benchmarks.reconstruct",
     "references": "benchmarks.references",
+    "quick-figures": "benchmarks.quick_figures",
     "regression": "benchmarks.regression",
     "relight": "benchmarks.relight",
     "resample": "benchmarks.resample",

@@ -1,363 +1,107 @@
-"""What the quick scene's figures are, stage by stage, how far they may move, and proof that the limits catch a slip.
+"""What the comparison with stored scores catches and what it calls worse by mistake, on the frozen captures.
 
-    python -m benchmarks regression --json tests/regression/figures.json
+    python -m benchmarks regression --json FILE
 
-The simulated capture is reproducible, so on the same capture a figure moves only where the pipeline does: its limit is
-the committed figure and a tolerance far below a tenth of it, but above what other linear algebra kernels and numbers of
-threads do (measured here). A change of the simulation, or a processor on which photons round to other paths, makes
-another capture: then the limit is a bound from the spread of the figures over fresh captures, each of another seed and
-so of another rig, another scan and other noise. `caught_from` is the growth of an error that this wider bound catches.
-
-Shown beside them: `power`, the share of perturbations caught, each of which makes one figure of a stage a tenth worse;
-`false_alarm_rate`, the share of runs refused that are as good as the committed one: repetitions with other kernels, and
-fresh captures judged by the bound from the other ones.
+`power`: by stage, the share of perturbations called worse, each of which makes one figure of the stage a tenth worse.
+`false_alarm_rate`: the share of figures called worse between two outputs that err alike. Their errors about the mean of
+truth and references mirror each other, and these are drawn anew: each replicate, or half, is that mean and the noise
+that it was seen to have, with random signs column by column, or block of pixels by block. A rate of one in a thousand
+takes too many draws to be seen; what is measured at `LEVEL` is stated beside it.
 """
 
 from __future__ import annotations
 
-import hashlib
-import os
-import platform
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.random import Generator
-from rich.console import Console
-from scipy.ndimage import gaussian_filter
-from scipy.optimize import brentq
-from scipy.stats import t as student
 
-from benchmarks.stage_figures import (
-    FIGURES,
-    StageOutputs,
-    TrueRun,
-    all_figures,
-    load_outputs,
-    load_true_run,
-)
-from disco_twin.experiment.pipeline_process import reconstruct_apart
-from disco_twin.experiment.run_folder import RunFolder
-from disco_twin.faults.actual_rig import nudge
-from disco_twin.light.truth import Truth
-from disco_twin.run.stages import Run, begin_run, capture_stages, pipeline_stage, truth_stages
-from pipeline.calibrate.calibration import Calibration
-from pipeline.geometry.camera import pose_rows
-
-REPOSITORY = Path(__file__).resolve().parents[1]
-SCENE = REPOSITORY / "scenes" / "quick.toml"
-RUNS = REPOSITORY / "out" / "regression"  # kept: a changed pipeline finds its captures here
-METHOD = "default"
-FRESH = 10
-WORSE = 1.10
-LARGEST = (0.01, 0.1, 1.0, 10.0)  # sizes of perturbations that are tried
-TOLERANCE = 0.01  # of a figure, at least; a tenth worse has to stay far outside
-FALSE_ALARMS = 0.01  # of fresh captures, over all figures together
-KERNELS = ("Prescott", "Haswell", "SkylakeX")  # OpenBLAS: without FMA, with AVX2, with AVX-512
-
-
-@dataclass(frozen=True)
-class Limit:
-    """frozen: a figure on the committed capture; tolerance: how much worse it may be there; bound: on any capture.
-
-    moved: the most that other linear algebra kernels moved it; caught_from: error, over the frozen one, that the bound
-    catches.
-    """
-
-    frozen: float
-    moved: float
-    tolerance: float
-    bound: float
-    caught_from: float
-
-    def allowed(self, same_capture: bool) -> float:
-        """The largest error that passes."""
-        return abs(self.frozen) + self.tolerance if same_capture else self.bound
-
-
-def too_large(
-    figures: Mapping[str, float], limits: Mapping[str, Limit], same_capture: bool, partly: bool = False
-) -> dict[str, str]:
-    """The figures whose errors are beyond their limits, each with both numbers; what is no number is beyond, and so is
-    a figure that is not there, unless only a part is given (`partly`).
-    """
-    missing = set() if partly else set(limits) - set(figures)
-    return {name: f"missing (committed {limits[name].frozen:+.5g})" for name in sorted(missing)} | {
-        name: f"{value:+.5g} (allowed {limits[name].allowed(same_capture):.5g}, committed {limits[name].frozen:+.5g})"
-        for name, value in figures.items()
-        if not abs(value) <= limits[name].allowed(same_capture)
-    }
-
-
-def bounds(samples: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """By figure, what one more capture exceeds with a probability of `FALSE_ALARMS` over all figures (Student's t)."""
-    n, names = len(samples), list(samples[0])
-    reach = float(student.ppf(1 - FALSE_ALARMS / len(names), n - 1)) * np.sqrt(1 + 1 / n)
-    values = {name: np.array([s[name] for s in samples]) for name in names}
-    return {k: abs(float(v.mean())) + reach * float(v.std(ddof=1)) for k, v in values.items()}
-
-
-def fingerprint(folder: RunFolder) -> str:
-    """Of the images, the scan and the truth: equal where the same photons were simulated."""
-    digest = hashlib.blake2b(Truth.load(folder.twin / "truth.npz").mean.tobytes(), digest_size=16)
-    for path in (*sorted(folder.capture.glob("**/images.bin")), folder.capture / "scan.ply"):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
-def processor() -> str:
-    """The processor's name, family, model and stepping, on which the rounding of photons' paths depends; elsewhere than
-    on Linux its architecture.
-    """
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().split("\n\n")[0].splitlines() if info.is_file() else []
-    known = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
-    parts = [known[key] for key in ("model name", "cpu family", "model", "stepping") if key in known]
-    return " ".join(parts) or platform.machine()
-
-
-# Perturbations ------------------------------------------------------------------------------------------------------
-
-Perturbation = Callable[[StageOutputs, float, Generator], StageOutputs]
-
-
-def _shaken_views(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
-    own = outputs.calibration
-    moved = [_posed(v, nudge(rng, size, 2 * size) @ np.array(v.object_to_camera)) for v in own.views]
-    return replace(outputs, calibration=own.model_copy(update={"views": tuple(moved)}))
-
-
-def _turned_frames(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
-    own = outputs.calibration
-    turns = [nudge(rng, 0.0, size) for _ in range(own.n_angles)]
-    moved = [_posed(v, np.array(v.object_to_camera) @ turns[i % own.n_angles]) for i, v in enumerate(own.views)]
-    return replace(outputs, calibration=own.model_copy(update={"views": tuple(moved)}))
-
-
-def _posed(view: Any, pose: Any) -> Any:
-    return view.model_copy(update={"object_to_camera": pose_rows(pose)})
-
-
-def _shifted_projector(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
-    own, motion = outputs.calibration, nudge(rng, size, size / 10)
-    moved = [
-        p.model_copy(update={"object_to_projector": pose_rows(motion @ np.array(p.object_to_projector))})
-        for p in own.projectors
-    ]
-    calibration: Calibration = own.model_copy(update={"projectors": tuple(moved)})
-    return replace(outputs, calibration=calibration)
-
-
-def _scattered_spots(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
-    position = outputs.spots.position
-    return replace(
-        outputs, spots=replace(outputs.spots, position=position + size * rng.standard_normal(position.shape))
-    )
-
-
-def _moved_spots(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
-    return replace(
-        outputs, spots=replace(outputs.spots, position=outputs.spots.position + size * rng.standard_normal(3))
-    )
-
-
-def _noisy_samples(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
-    return replace(outputs, values=outputs.values * np.exp(size * rng.standard_normal(outputs.values.shape)))
-
-
-def _scaled_samples(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
-    return replace(outputs, values=outputs.values * np.exp(_sign(rng) * size))
-
-
-def _noisy_entries(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
-    entries = outputs.exitance
-    return replace(outputs, exitance=entries * np.exp(size * rng.standard_normal(entries.shape)))
-
-
-def _scaled_entries(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
-    return replace(outputs, exitance=outputs.exitance * np.exp(_sign(rng) * size))
-
-
-def _noisy_images(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
-    return _with_images(outputs, lambda image: image * np.exp(size * rng.standard_normal(image.shape)))
-
-
-def _scaled_images(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
-    factor = np.exp(_sign(rng) * size)
-    return _with_images(outputs, lambda image: image * factor)
-
-
-def _blurred_images(outputs: StageOutputs, size: float, rng: Generator) -> StageOutputs:
-    return _with_images(outputs, lambda image: gaussian_filter(image, (0, 10 * size, 10 * size)))
-
-
-def _with_images(outputs: StageOutputs, change: Callable[[Any], Any]) -> StageOutputs:
-    return replace(outputs, images={key: change(image) for key, image in outputs.images.items()})
-
-
-def _sign(rng: Generator) -> int:
-    return int(rng.choice([-1, 1]))
-
-
-PERTURBATIONS: dict[str, tuple[Perturbation, ...]] = {
-    "pose": (_shaken_views, _turned_frames),
-    "projector": (_shifted_projector,),
-    "spots": (_scattered_spots, _moved_spots),
-    "samples": (_noisy_samples, _scaled_samples),
-    "completion": (_noisy_entries, _scaled_entries),
-    "relit": (_noisy_images, _scaled_images, _blurred_images),
-}
-
-
-def stage_outputs(outputs: StageOutputs) -> Iterator[tuple[str, StageOutputs]]:
-    """(stage, outputs) for each stage; relit images one by one, so that each is perturbed alone."""
-    for stage in FIGURES:
-        if stage != "relit":
-            yield stage, outputs
-    for key, image in outputs.images.items():
-        yield "relit", replace(outputs, images={key: image})
-
-
-def made_worse(
-    stage: str, outputs: StageOutputs, true: TrueRun, perturbation: Perturbation, name: str, seed: int
-) -> StageOutputs | None:
-    """The outputs perturbed until the error `name` is `WORSE` times what it was; None where it never is."""
-    before = abs(FIGURES[stage](outputs, true)[name])
-
-    def perturbed(size: float) -> StageOutputs:
-        return perturbation(outputs, size, np.random.default_rng(seed))
-
-    def growth(size: float) -> float:
-        return abs(FIGURES[stage](perturbed(size), true)[name]) / before - WORSE
-
-    largest = next((size for size in LARGEST if growth(size) > 0), None)
-    return None if largest is None else perturbed(brentq(growth, 0.0, largest, xtol=1e-6, rtol=1e-4))
-
-
-def power(
-    outputs: StageOutputs, true: TrueRun, limits: Mapping[str, Limit], repetitions: int
-) -> tuple[dict[str, float], int]:
-    """By stage, the share of perturbations that are caught on the same capture; and how many there were."""
-    caught: dict[str, list[bool]] = {stage: [] for stage in FIGURES}
-    for stage, own in stage_outputs(outputs):
-        for name in FIGURES[stage](own, true):
-            tries = [
-                made_worse(stage, own, true, perturbation, name, seed)
-                for perturbation in PERTURBATIONS[stage]
-                for seed in range(repetitions)
-            ]
-            worse = [FIGURES[stage](outputs, true) for outputs in tries if outputs is not None]
-            caught[stage] += [bool(too_large(figures, limits, True, partly=True)) for figures in worse] or [False]
-    return {stage: float(np.mean(c)) for stage, c in caught.items()}, sum(len(c) for c in caught.values())
-
-
-# The command ---------------------------------------------------------------------------------------------------------
-
-
-def take_run(seed: int, quick: bool) -> Run:
-    """A whole run but for its scores, in a folder that is kept; what is finished there is not done again."""
-    folder = RUNS / f"{'small' if quick else 'full'}-{seed}"
-    RUNS.mkdir(parents=True, exist_ok=True)
-    scene = RUNS / f"seed-{seed}.toml"
-    text = SCENE.read_text()
-    assert text.count("\nseed = 1\n") == 1
-    scene.write_text(text.replace("\nseed = 1\n", f"\nseed = {seed}\n"))
-    run = begin_run(scene, folder, "small" if quick else "full", METHOD, Console(quiet=True))
-    run = replace(run, methods=(METHOD,), scene_file=SCENE)  # without the baselines; beside the committed references
-    capture_stages(run)
-    truth_stages(run)
-    pipeline_stage(run)
-    return run
-
-
-def figures_of(run: Run, folder: RunFolder | None = None) -> dict[str, float]:
-    """All figures of a run, or of another pipeline's work on it in `folder`."""
-    true = load_true_run(run.experiment, run.folder)
-    return all_figures(load_outputs(run.experiment, folder or run.folder, true), true)
-
-
-def repeated(run: Run) -> list[dict[str, float]]:
-    """The pipeline again on the same capture, with each of other linear algebra kernels and two threads."""
-    out = []
-    for kernel in KERNELS:
-        variant = run.folder.variant(run.folder.root / f"kernel-{kernel}")
-        variant.work.mkdir(parents=True, exist_ok=True)
-        with _environment(OPENBLAS_CORETYPE=kernel, OPENBLAS_NUM_THREADS="2"):
-            reconstruct_apart(run.scene, variant, run.methods)
-        out.append(figures_of(run, variant))
+from benchmarks.frozen import SCENES, Frozen
+from benchmarks.frozen_scores import load_scores
+from benchmarks.perturbations import PERTURBATIONS, made_worse, stage_outputs
+from disco_twin.evaluate.compare import ALPHA, Difference, compare, worse
+from disco_twin.evaluate.stage_figures import FIGURES, StageOutputs, TrueRun
+from pipeline.relight.scores import BLOCK
+
+REPETITIONS = 20
+DRAWS = 40
+LEVEL = 0.05  # of one figure, at which false alarms are counted
+NOT_ALIKE = "totals"  # what mirrored entries come to does not err alike
+
+
+def caught(
+    stored: StageOutputs, slack: Mapping[str, float], true: TrueRun, repetitions: int, others: int = 0
+) -> dict[str, list[bool]]:
+    """By stage, whether each perturbed output is called worse; others: figures of other objects that are judged too."""
+    out: dict[str, list[bool]] = {stage: [] for stage in FIGURES}
+    for stage, own in stage_outputs(stored):
+        before = FIGURES[stage](own, true)
+        names = [name for name, value in before.items() if 0.1 * abs(value) > 2 * slack[name]]  # next to nothing: no
+        for k in range(repetitions if names else 0):
+            rng = np.random.default_rng(k)
+            name, perturbation = names[k % len(names)], PERTURBATIONS[stage][k % len(PERTURBATIONS[stage])]
+            bad = made_worse(stage, own, true, perturbation, name, int(rng.integers(1 << 31)))
+            if bad is not None:
+                whole = replace(bad, images=stored.images | bad.images)
+                out[stage].append(bool(worse(compare(stored, whole, true), slack, ALPHA, others)))
     return out
 
 
-@contextmanager
-def _environment(**values: str) -> Iterator[None]:
-    before = {key: os.environ.get(key) for key in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for key, value in before.items():
-            os.environ.pop(key) if value is None else os.environ.update({key: value})
+def drawn_anew(true: TrueRun, rng: np.random.Generator) -> TrueRun:
+    """Truth and references about the same means, with other noise of the same size."""
+    r = true.truth.replicates.astype(np.float64)
+    n, mean = len(r), r.mean(axis=0)
+    noise = (r - mean) * np.sqrt(n / (n - 1)) * rng.choice([-1.0, 1.0], (n, r.shape[1], r.shape[2], 1))
+    halves = {}
+    for key, (a, b) in true.halves.items():
+        middle, half = 0.5 * (a.astype(np.float64) + b), 0.5 * (a.astype(np.float64) - b)
+        blocks = rng.choice([-1.0, 1.0], (2, *(-(-size // BLOCK) for size in middle.shape[1:])))
+        signs = blocks.repeat(BLOCK, 1).repeat(BLOCK, 2)[:, None, : middle.shape[1], : middle.shape[2]]
+        halves[key] = middle + np.sqrt(2.0) * signs * half
+    return replace(true, truth=replace(true.truth, replicates=mean + noise), halves=halves)
 
 
-def make_limits(
-    frozen: Mapping[str, float], repetitions: Sequence[Mapping[str, float]], fresh: Sequence[Mapping[str, float]]
-) -> dict[str, Limit]:
-    """A limit for every figure.
-
-    Raises: ValueError where kernels move a figure by so much that a tenth would not stand out.
-    """
-    bound, limits = bounds(fresh), {}
-    for name, value in frozen.items():
-        if not (np.isfinite(value) and value):
-            raise ValueError(f"{name}: {value} is no error that a later one can be compared with")
-        moved = max((abs(r[name] - value) for r in repetitions), default=0.0)
-        tolerance = max(TOLERANCE * abs(value), 10 * moved)
-        if tolerance > 0.5 * (WORSE - 1) * abs(value):
-            raise ValueError(f"{name}: {value:.4g} moves by {moved:.1g} with the linear algebra's kernels")
-        limits[name] = Limit(value, moved, tolerance, bound[name], bound[name] / abs(value))
-    return limits
+def mirrored(outputs: StageOutputs, true: TrueRun) -> StageOutputs:
+    """Outputs whose entries and images err as much to the other side of the truth's and the references' means."""
+    exitance = outputs.exitance
+    assert exitance is not None
+    mean = true.truth.mean
+    other = np.where((mean > 0) & (exitance > 0), mean**2 / np.where(exitance > 0, exitance, 1.0), exitance)
+    images = {key: np.mean(true.halves[key], axis=0, dtype=np.float64) * 2 - x for key, x in outputs.images.items()}
+    return replace(outputs, exitance=other, images=images)
 
 
-def false_alarms(
-    repetitions: Sequence[Mapping[str, float]], fresh: Sequence[Mapping[str, float]], limits: Mapping[str, Limit]
-) -> list[bool]:
-    """Which of the runs that are as good as the committed one are refused; each fresh one by the others' bound."""
-    refused = [bool(too_large(figures, limits, True)) for figures in repetitions]
-    for i, figures in enumerate(fresh):
-        others = bounds([*fresh[:i], *fresh[i + 1 :]])
-        judged = {name: replace(limit, bound=others[name]) for name, limit in limits.items()}
-        refused.append(bool(too_large(figures, judged, False)))
-    return refused
-
-
-def report(
-    frozen: tuple[StageOutputs, TrueRun], key: str, repetitions: Sequence[Mapping[str, float]],
-    fresh: Sequence[Mapping[str, float]], tries: int,
-) -> dict[str, Any]:  # fmt: skip
-    """The record that the tests read."""
-    limits = make_limits(all_figures(*frozen), repetitions, fresh)
-    caught, perturbations = power(*frozen, limits, tries)
-    refused = false_alarms(repetitions, fresh, limits)
-    return {
-        "command": "python -m benchmarks regression --json tests/regression/figures.json",
-        "fingerprint": key,
-        "processor": processor(),
-        "fresh_captures": len(fresh),
-        "repetitions": perturbations,
-        "power": caught,
-        "false_alarm_rate": float(np.mean(refused)),
-        "figures": {name: asdict(limit) for name, limit in limits.items()},
-        "fresh": [dict(figures) for figures in fresh],
-    }
+def by_chance(stored: StageOutputs, true: TrueRun, draws: int, seed: int) -> list[Difference]:
+    """Differences of figures between outputs that err alike, in this many draws of the noise that judges them."""
+    rng, other, out = np.random.default_rng(seed), mirrored(stored, true), list[Difference]()
+    for k in range(draws):
+        pair = (stored, other) if k % 2 else (other, stored)
+        found = compare(*pair, drawn_anew(true, rng))
+        out += [d for d in found if d.error > 0 and d.stage != "samples" and NOT_ALIKE not in d.figure]
+    return out
 
 
 def run(quick: bool = False) -> dict[str, Any]:
-    """The record of `report`, after captures, repetitions and perturbations; `quick`: two small fresh captures."""
-    first = take_run(1, quick)
-    true = load_true_run(first.experiment, first.folder)
-    frozen = load_outputs(first.experiment, first.folder, true), true
-    fresh = [figures_of(take_run(seed, quick)) for seed in range(2, 2 + (2 if quick else FRESH))]
-    return report(frozen, fingerprint(first.folder), [] if quick else repeated(first), fresh, 1 if quick else 5)
+    """Over all objects; `quick`: one of them, few repetitions."""
+    power: dict[str, list[bool]] = {stage: [] for stage in FIGURES}
+    chances: list[Difference] = []
+    objects = list(SCENES)[:1] if quick else list(SCENES)
+    for seed, name in enumerate(objects):
+        frozen = Frozen.load(name)
+        stored, slack = load_scores(frozen.scores_file)
+        others = (len(SCENES) - 1) * len(slack)
+        for stage, own in caught(stored, slack, frozen.true, 2 if quick else REPETITIONS, others).items():
+            power[stage] += own
+        chances += by_chance(stored, frozen.true, 4 if quick else DRAWS, seed)
+    alarms = [d.chance() < LEVEL for d in chances]
+    return {
+        "objects": len(objects),
+        "repetitions": sum(map(len, power.values())),
+        "power": {stage: float(np.mean(own)) for stage, own in power.items() if own},
+        "level": LEVEL,
+        "false_alarm_rate": float(np.mean(alarms)),
+        "draws": len(alarms),
+        "alpha": ALPHA,
+        "false_alarms_at_alpha": float(np.mean([d.chance() < ALPHA for d in chances])),
+    }

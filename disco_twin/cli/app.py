@@ -36,6 +36,7 @@ FaultsOption = Annotated[
 MethodsOption = Annotated[
     str | None, typer.Option(help="`all`, or a list such as default,disco2004; left out: the scene's.")
 ]
+PLOTS = (".svg", ".png", ".pdf")
 app.add_typer(rig_app, name="rig")
 
 
@@ -212,6 +213,48 @@ def budget(
     for what, why in made.left_out.items():
         console.print(f"no row for {what}: {why}", highlight=False, soft_wrap=True)
     console.print("Parts act on each other: what they cost need not add up in quadrature.", highlight=False)
+
+
+@app.command()
+def compare(
+    first: Annotated[Path, typer.Argument(metavar="OUT1", help="A finished run.", parser=given("OUT1"))],
+    second: Annotated[
+        Path, typer.Argument(metavar="OUT2", help="Another one of the same capture.", parser=given("OUT2"))
+    ],
+    methods: Annotated[
+        str, typer.Option(help="A method of both, or that of the first and that of the second: default,disco2004.")
+    ] = "default",
+    plot: Annotated[
+        Path | None,
+        typer.Option("--plot", metavar="FILE.svg", help="Draw it; .svg, .png or .pdf.", parser=given("--plot")),
+    ] = None,
+) -> None:
+    """Compare two reconstructions of one capture, two methods or two versions of the code, figure by figure."""
+    from disco_twin.cli.tables import difference_table
+    from disco_twin.evaluate.compare import compare_runs
+
+    names = [name.strip() for name in methods.split(",") if name.strip()]
+    if len(names) not in (1, 2):
+        raise InputError(
+            "names no method or too many", key="--methods", value=methods, allowed="one method, or two",
+            remedy="default,disco2004 compares the first's default with the second's disco2004",
+        )  # fmt: skip
+    if plot is not None and plot.suffix not in PLOTS:
+        raise InputError(
+            "is no kind of picture that can be drawn", key="--plot", value=str(plot), allowed=", ".join(PLOTS),
+            remedy=f"{plot.stem}.svg",
+        )  # fmt: skip
+    differences = compare_runs(first, second, (names[0], names[-1]))
+    shown = (names[0], names[1]) if len(names) == 2 else (first.name, second.name)
+    if shown[0] == shown[1]:
+        shown = "first", "second"
+    console.print(difference_table(differences, *shown))
+    console.print("Errors, so more is worse; by: of the second; +-: standard error.", highlight=False)
+    if plot is not None:
+        from disco_twin.report.differences import write_differences
+
+        write_differences(plot, differences, *shown)
+        console.print(f"plot: {plot.resolve()}", soft_wrap=True, highlight=False)
 
 
 @app.command()

@@ -12,6 +12,7 @@ from disco_twin.evaluate.summary import figure_or_dash, pooled
 from pipeline.capture.quality import ViewQuality
 
 if TYPE_CHECKING:
+    from disco_twin.evaluate.compare import Difference
     from disco_twin.run.budget.rows import Budget
 
 QUALITY = ("view", "camera", "deg", "images", "saturated", "lit", "range", "dark", "mW")
@@ -38,6 +39,19 @@ def budget_tables(budget: Budget) -> tuple[Table, Table]:
     for part in (*COSTS, LEFT):
         costs.add_row(part, *(figure_or_dash(budget.cost(part, light)) for light in lights))
     return made, costs
+
+
+def difference_table(differences: Sequence[Difference], first: str, second: str) -> Table:
+    """A row for every figure; what is called better or worse is so beyond chance, all rows together."""
+    from disco_twin.evaluate.compare import worse
+
+    table = _table(("error", first, second, "by", "+-", ""), "error", no_wrap=True)
+    later, sooner = ({d.figure for d in worse(rows)} for rows in (differences, [d.swapped for d in differences]))
+    for d in differences:
+        verdict = "worse" if d.figure in later else "better" if d.figure in sooner else ""
+        error = "exact" if d.error == 0 else f"{d.error:.2g}"
+        table.add_row(d.figure, f"{d.first:.4g}", f"{d.second:.4g}", f"{d.difference:+.2g}", error, verdict)
+    return table
 
 
 def quality_table(views: Sequence[ViewQuality]) -> Table:

@@ -2,8 +2,8 @@
 
 Rationale: a change that makes a stage a tenth worse is to be noticed, and to name the stage. figures.json beside this
 file holds each figure, and how far it may move on the capture that is committed and on any other one;
-`python -m benchmarks regression` makes it and says how. Figures that a change has made better are committed by the same
-command.
+`python -m benchmarks quick-figures` makes it and says how. Figures that a change has made better are committed by the
+same command. tests/regression/test_frozen.py is what every change is held to.
 """
 
 from __future__ import annotations
@@ -20,22 +20,15 @@ import numpy as np
 import pytest
 from failing_images import images_on_failure
 
-from benchmarks.regression import (
-    PERTURBATIONS,
-    Limit,
-    fingerprint,
-    made_worse,
-    processor,
-    stage_outputs,
-    too_large,
-)
-from benchmarks.stage_figures import FIGURES, StageOutputs, TrueRun, load_outputs, load_true_run
+from benchmarks.perturbations import PERTURBATIONS, made_worse, stage_outputs
+from benchmarks.quick_figures import Limit, fingerprint, processor, too_large
+from disco_twin.evaluate.stage_figures import FIGURES, StageOutputs, TrueRun, load_outputs, load_true_run
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.scene.scene import load_scene
 from pipeline.relight.scores import signed_root
 
-pytestmark = pytest.mark.timeout(1200)  # the first test waits for the run: two minutes on two idle cores
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]  # the first test waits for the run
 
 COMMITTED = json.loads(Path(__file__).with_name("figures.json").read_text())
 LIMITS = {name: Limit(**limit) for name, limit in COMMITTED["figures"].items()}
@@ -85,7 +78,7 @@ def test_the_capture_is_the_committed_one(quick: QuickRun) -> None:
         pytest.skip(
             f"another capture on {processor()} than on {COMMITTED['processor']}: figures are held to wide bounds"
         )
-    assert quick.same_capture, "the simulation has changed: python -m benchmarks regression commits its figures anew"
+    assert quick.same_capture, "the simulation has changed: python -m benchmarks quick-figures commits its figures anew"
 
 
 @pytest.mark.parametrize("stage", [stage for stage in FIGURES if stage != "relit"])

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 from frozen_run import write_frozen_run
+from refusals import Says
 from rich.console import Console
 
+from disco_twin.cli.app import main
 from disco_twin.experiment.pipeline_process import load_results
 from disco_twin.run.stages import pipeline_stage, reopen_run, score_stages
 
@@ -53,3 +56,34 @@ def test_models_of_other_settings_do_not_stay(root: Path) -> None:
     vars(run.experiment)["scene"] = run.scene.model_copy(update={"reconstruct": own})
     pipeline_stage(run)
     assert set(load_results(run.folder).methods) == BASELINES
+
+
+def test_two_methods_are_compared(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """On one capture, and that of a copy: a table with standard errors, a plot, and nothing between equals."""
+    plot, copy = tmp_path / "differences.svg", tmp_path / "copy"
+    with pytest.raises(SystemExit) as ended:
+        main(["compare", str(root), str(root), "--methods", "dipole,lambertian", "--plot", str(plot)])
+    assert ended.value.code == 0
+    table = capsys.readouterr().out
+    assert "relit/directional@left nrmse" in table and "spots/place mm" in table
+    assert "completion" not in table  # the Lambertian one states no R_d
+    assert "worse" in table
+    assert "<svg" in plot.read_text()
+    shutil.copytree(root, copy)
+    with pytest.raises(SystemExit):
+        main(["compare", str(root), str(copy), "--methods", "dipole"])
+    same = capsys.readouterr().out
+    assert "completion/decade 0 log10 rmse" in same
+    assert "worse" not in same.replace("more is worse", "") and "better" not in same
+
+
+def test_what_cannot_be_compared_is_refused(root: Path, tmp_path: Path, says: Says) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(root, copy)
+    plan = copy / "capture" / "plan.json"
+    plan.write_text(plan.read_text() + " ")
+    assert "plan.json differs" in says("compare", root, copy, "--methods", "dipole")
+    assert "model-nonesuch.npz" in says("compare", root, root, "--methods", "nonesuch")
+    assert "--plot" in says("compare", root, root, "--methods", "dipole", "--plot", tmp_path / "x.txt")
+    assert "--methods" in says("compare", root, root, "--methods", "a,b,c")
+    assert "no run folder" in says("compare", root, tmp_path)

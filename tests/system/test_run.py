@@ -20,7 +20,7 @@ SHRINK = """
 [simulation]
 walks_per_spot = 30_000
 truth_columns = 16
-truth_walks = 400_000
+truth_walks = 100_000
 reference_noise = 0.04
 
 [relight]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.regression import FALSE_ALARMS, Limit, bounds, false_alarms, make_limits, too_large
+from benchmarks.quick_figures import FALSE_ALARMS, Limit, bounds, false_alarms, make_limits, too_large
 
 FIGURES = {"pose/a": 2.0, "relit/b": -0.5}
 

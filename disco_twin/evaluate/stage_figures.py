@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy import sparse
 
 from disco_twin.camera.lars3 import lars3_sensor
 from disco_twin.evaluate.entries import score_entries
@@ -55,13 +56,13 @@ class StageOutputs:
 
     spots: as located on the scan; values: (L, S, V) samples in mm^-2, NaN where not observed, times Tbar^2 of the
     boundary that they were divided by; exitance: (L, n, V) mm^-2, Tbar^2 R_d of the completed model for the vertices in
-    `TrueRun.truth`; lit: (n,) whether a spot lies in their triangles.
+    `TrueRun.truth`, None where the method states none; lit: (n,) whether a spot lies in their triangles.
     """
 
     calibration: Calibration
     spots: Spots
     values: F64
-    exitance: F64
+    exitance: F64 | None
     lit: NDArray[np.bool_]
     images: dict[tuple[str, str], NDArray[np.floating[Any]]]
 
@@ -104,16 +105,15 @@ def load_true_run(experiment: Experiment, folder: RunFolder) -> TrueRun:
 
 
 def load_outputs(experiment: Experiment, folder: RunFolder, true: TrueRun, method: str = "default") -> StageOutputs:
-    """What a run's stages left in WORK; the method's model has to state R_d."""
+    """What a run's stages left in WORK. Raises: InputError where a file is missing or damaged."""
     columns = load_model(folder, method).exitance_columns(true.truth.columns)
-    assert columns is not None, f"{method} states no R_d"
     samples = load_samples(folder.work / "samples.npz")
     relight = experiment.scene.relight
     return StageOutputs(
         Calibration.load(folder.work / "calibration.json"),
         samples.spots,
         samples.values.astype(np.float64) * mean_transmittance(samples.eta) ** 2,
-        np.asarray(columns.mean, np.float64),
+        None if columns is None else np.asarray(columns.mean, np.float64),
         lit_vertices(samples)[true.truth.columns],
         {(x.name, v.name): load_relit(folder, method, x.name, v) for x in relight.lights for v in relight.views},
     )
@@ -157,9 +157,13 @@ def spot_figures(outputs: StageOutputs, true: TrueRun) -> dict[str, float]:
     return {"spots/place mm": _rms([np.linalg.norm(spots.position - true.hits, axis=1)[used]])}
 
 
-def sample_figures(outputs: StageOutputs, true: TrueRun) -> dict[str, float]:
-    """By reciprocity light from a spot to a vertex is the true column of the vertex, at the spot's footprint."""
-    truth, footprint = true.truth, beam_footprints(true.scan, outputs.spots)
+def sample_figures(outputs: StageOutputs, true: TrueRun, footprint: sparse.csr_array | None = None) -> dict[str, float]:
+    """By reciprocity light from a spot to a vertex is the true column of the vertex, at the spot's footprint.
+
+    footprint: (S, V) `beam_footprints`, where they are known already
+    """
+    truth = true.truth
+    footprint = beam_footprints(true.scan, outputs.spots) if footprint is None else footprint
     estimate = outputs.values[:, :, truth.columns].transpose(0, 2, 1)  # (L, n, S)
     mean = np.stack([(footprint @ column.T).T for column in truth.mean])
     error = np.stack([np.sqrt(footprint.power(2) @ (column**2).T).T for column in truth.standard_error])
@@ -171,6 +175,8 @@ def completion_figures(outputs: StageOutputs, true: TrueRun) -> dict[str, float]
     bias of totals counts with its standard error: one that happens to be next to nothing is no better than that.
     """
     truth, exitance = true.truth, outputs.exitance
+    if exitance is None:
+        return {}
     figures = _by_decade("completion", exitance, truth.mean, truth.standard_error)
     for name, chosen in {"lit": outputs.lit, "unlit": ~outputs.lit}.items():
         score = score_totals(exitance @ truth.area, truth, chosen)
