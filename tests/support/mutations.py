@@ -44,7 +44,8 @@ def mutated(draw: st.DrawFn, data: Any, most: int = 2) -> Any:
         if kind == "left out":
             del table[last]
         elif kind == "added" and isinstance(table, dict):
-            table[draw(st.sampled_from(["extra", "name", "kind", "Name"]))] = draw(st.sampled_from(STRANGE))
+            key = draw(st.sampled_from(["extra", "name", "kind", "Name"]))
+            table[key] = copy.deepcopy(draw(st.sampled_from(STRANGE)))
         elif kind == "again" and isinstance(table, list):
             table.append(copy.deepcopy(value))
         elif kind == "nudged" and isinstance(value, int) and not isinstance(value, bool):
@@ -56,7 +57,7 @@ def mutated(draw: st.DrawFn, data: Any, most: int = 2) -> Any:
         elif kind == "nudged" and isinstance(value, str) and value:
             table[last] = value[::-1]
         else:
-            table[last] = draw(st.sampled_from(STRANGE))
+            table[last] = copy.deepcopy(draw(st.sampled_from(STRANGE)))
         if not list(places(out)):
             break
     return out
