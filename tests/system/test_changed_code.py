@@ -98,6 +98,7 @@ def stages_done(project: Path) -> set[str]:
     return {line.split()[0] for line in run_in(project, PROGRAM).splitlines() if " MiB" in line}
 
 
+@pytest.mark.slow
 def test_truth_is_computed_again_when_what_it_imports_has_changed_and_only_then(project: Path) -> None:
     """Truth divides by the areas of hat functions: with a quarter of them, the truth of before is four times off."""
     truth = project / "out" / "twin" / "truth.npz"

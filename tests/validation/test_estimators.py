@@ -24,7 +24,7 @@ from pipeline.geometry.camera import PinholeCamera, look_at
 REPLICATES = 32
 
 
-@pytest.mark.parametrize(("g", "alpha"), [(0.0, 0.3), (0.8, 0.3), (0.0, 0.05)])
+@pytest.mark.parametrize(("g", "alpha"), [(0.0, 0.3), (0.8, 0.3), pytest.param(0.0, 0.05, marks=pytest.mark.slow)])
 def test_lobe_connection_is_unbiased(g: float, alpha: float) -> None:
     """Rationale: lobe connections and exits share each path by the balance heuristic; a density that is wrong, or used
     in one technique only, moves energy.
@@ -53,7 +53,7 @@ def test_lobe_connection_is_unbiased(g: float, alpha: float) -> None:
     assert np.all(per_walk[0] < per_walk[1] / 2)
 
 
-@pytest.mark.parametrize("kind", ["rough", "matched"])
+@pytest.mark.parametrize("kind", ["rough", pytest.param("matched", marks=pytest.mark.slow)])
 def test_many_cameras_are_drawn_from(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rationale: of many cameras each connection reaches a few, whose contributions count for the others.
 

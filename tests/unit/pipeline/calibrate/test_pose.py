@@ -57,6 +57,7 @@ def seen() -> Silhouettes:
     return silhouettes(4, experiment().scan)
 
 
+@pytest.mark.slow
 def test_a_broken_stage_shows(seen: Silhouettes, monkeypatch: pytest.MonkeyPatch) -> None:
     """Half a pixel, a turntable that runs the other way and degrees taken for radians: the bounds are missed.
 

@@ -113,6 +113,7 @@ def test_a_bump_on_a_balls_scan_is_taken_off() -> None:
     assert rms(left / scan.error) < 1.5
 
 
+@pytest.mark.slow
 def test_the_object_may_stand_turned_and_its_vertices_be_numbered_anew(
     stone: tuple[Silhouettes, trimesh.Trimesh, F64], found: PoseFit
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import trimesh
 from reconstruct_synthetic import F64, make, rmse_log10
 
@@ -22,6 +23,7 @@ def rate(count: F64, error: F64) -> F64:
     return np.asarray(np.log(error) @ x / (x @ x))
 
 
+@pytest.mark.slow
 def test_the_fill_s_error_falls_with_the_spots() -> None:
     """Rationale: what the profile leaves is a Gaussian field of smoothness 1 to the method (`Harmonics.roughness`).
     Of such a field, seen with noise at n places of a surface, a mean square of n^(-1/2) stays open at best, of a smooth

@@ -325,7 +325,7 @@ def lit_by_a_medium(mesh: trimesh.Trimesh, absorptions: tuple[float, ...]) -> tu
     return bare.with_readings(noise_per_signal=noise, **readings), truth
 
 
-@pytest.mark.parametrize("vertices", [2000, 400])
+@pytest.mark.parametrize("vertices", [2000, pytest.param(400, marks=pytest.mark.slow)])
 def test_a_medium_that_shows_fills_what_no_camera_saw(monkeypatch: pytest.MonkeyPatch, vertices: int) -> None:
     """Rationale: two bulbs and a neck, two wavelengths. Expected: the medium is taken, and far entries that nothing was
     measured next to come nearer to the truth, also where elements are coarser than the scan.
