@@ -142,20 +142,27 @@ def _of_image(plain: Difference, first: StageOutputs, second: StageOutputs, true
         return plain
     if what == "nrmse":  # of squares; a difference of roots is that over their sum
         squares, error = paired_difference(other, one, a, b, mask)
-        return replace(plain, difference=squares / size, error=error / size)
-    light_in, noise = _light(a, b, mask)
+        freedom = _freedom(_blocks((np.asarray(other, np.float64) - one) * (np.asarray(a, np.float64) - b), mask))
+        return replace(plain, difference=squares / size, error=error / size, freedom=freedom)
+    whole, sums = (_blocks(0.5 * (np.asarray(a, np.float64) + sign * b), mask) for sign in (1, -1))
     pull = math.copysign(1 + plain.second, plain.second) - math.copysign(1 + plain.first, plain.first)
-    return replace(plain, error=abs(pull) * noise / light_in)
+    error = abs(pull) * float(np.sqrt((sums**2).sum()) / whole.sum())
+    return replace(plain, error=error, freedom=_freedom(sums))
 
 
-def _light(a: F64, b: F64, mask: Bool) -> tuple[float, float]:
-    """All light of a reference's mean, and its standard error from sums over blocks of pixels."""
-    half = ((np.asarray(a, np.float64) - b) / 2).sum(axis=0) * mask
-    rows, columns = (-(-n // BLOCK) * BLOCK for n in half.shape)
-    whole = np.zeros((rows, columns))
-    whole[: half.shape[0], : half.shape[1]] = half
-    sums = whole.reshape(rows // BLOCK, BLOCK, columns // BLOCK, BLOCK).sum(axis=(1, 3))
-    return float((0.5 * (np.asarray(a, np.float64) + b).sum(axis=0) * mask).sum()), float(np.sqrt((sums**2).sum()))
+def _blocks(values: F64, mask: Bool) -> F64:
+    """(L, H, W) -> sums over wavelengths and blocks of the mask's pixels, 1-D."""
+    rows, columns = np.nonzero(mask)
+    block = (rows // BLOCK) * (mask.shape[1] // BLOCK + 1) + columns // BLOCK
+    return np.bincount(block, weights=values[:, mask].sum(axis=0)).astype(np.float64)
+
+
+def _freedom(parts: F64) -> float:
+    """Degrees of freedom of a variance that is the sum of the squares of these (Satterthwaite 1946): where a few blocks
+    make all the noise, as in the image of a spot, an error is known no better than from as many numbers.
+    """
+    fourth = float((parts**4).sum())
+    return float((parts**2).sum()) ** 2 / fourth if fourth > 0 else math.inf
 
 
 def compare_runs(first: Path, second: Path, methods: tuple[str, str]) -> list[Difference]:

@@ -21,7 +21,7 @@ SHRINK = """
 walks_per_spot = 30_000
 truth_columns = 16
 truth_walks = 100_000
-reference_noise = 0.04
+reference_noise = 0.2
 
 [relight]
 lights = ["uniform", "directional"]
