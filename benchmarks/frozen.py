@@ -16,7 +16,7 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,6 +49,7 @@ VERTICES, COLUMNS = 600, 16
 TRUTH_WALKS = {"quick": 40_000, "animal": 40_000, "ring": 5_000}  # a column; windows split the ring's far more often
 SCORES = "scores.npz"
 SLACK = 0.01  # of a figure, at least
+LIMIT = 0.05  # of a figure, that it may be worse by and chance be the reason
 NOTHING = 1e-3  # of a bias, which may happen to be next to nothing
 KERNEL = "Prescott"  # OpenBLAS without FMA: furthest from those of today's processors
 
@@ -166,12 +167,15 @@ def differences(frozen: Frozen, outputs: StageOutputs) -> tuple[list[Difference]
     return compare(stored, outputs, frozen.true), slack
 
 
-def judged(found: dict[str, tuple[list[Difference], dict[str, float]]], alpha: float = ALPHA) -> dict[str, list[str]]:
-    """By object, the figures that are worse at a level of `alpha` over all figures of all objects together."""
-    total = sum(len(own) for own, _ in found.values())
-    return {
-        name: [d.figure for d in worse(own, slack, alpha, total - len(own))] for name, (own, slack) in found.items()
-    }
+def grown(own: Sequence[Difference], slack: Mapping[str, float], alpha: float = ALPHA) -> list[Difference]:
+    """The figures of one object that are worse, at a level of `alpha` over those of all objects together; and those
+    that are worse by a twentieth whatever chance says: nothing but the pipeline can have moved them.
+    """
+    beyond_chance = {d.figure for d in worse(own, slack, alpha, (len(SCENES) - 1) * len(own))}
+    return [
+        d for d in own
+        if d.figure in beyond_chance or d.difference > max(LIMIT * abs(d.first), slack.get(d.figure, 0.0))
+    ]  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -191,7 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 store(frozen, Path(scratch))
                 continue
             found[name] = differences(frozen, frozen.reconstruct(Path(scratch)))
-    bad = judged(found)
+    bad = {name: [d.figure for d in grown(own, slack)] for name, (own, slack) in found.items()}
     for name, (own, _) in found.items():
         console.print(f"\n[bold]{name}[/bold]", difference_table(own, "stored", "now"), sep="\n")
         for figure in bad[name]:

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.frozen import SCENES, Frozen
+from benchmarks.frozen import SCENES, Frozen, grown
 from benchmarks.frozen_scores import load_scores
 from benchmarks.perturbations import PERTURBATIONS, made_worse, stage_outputs
-from disco_twin.evaluate.compare import ALPHA, Difference, compare, worse
+from disco_twin.evaluate.compare import ALPHA, Difference, compare
 from disco_twin.evaluate.stage_figures import FIGURES, StageOutputs, TrueRun
 from pipeline.relight.scores import BLOCK
 
@@ -30,10 +30,8 @@ LEVEL = 0.05  # of one figure, at which false alarms are counted
 NOT_ALIKE = ("totals", "bias")  # of mirrored entries: what they sum to, and where noise in a logarithm has a mean
 
 
-def caught(
-    stored: StageOutputs, slack: Mapping[str, float], true: TrueRun, repetitions: int, others: int = 0
-) -> dict[str, list[bool]]:
-    """By stage, whether each perturbed output is called worse; others: figures of other objects that are judged too."""
+def caught(stored: StageOutputs, slack: Mapping[str, float], true: TrueRun, repetitions: int) -> dict[str, list[bool]]:
+    """By stage, whether each perturbed output is called worse."""
     out: dict[str, list[bool]] = {stage: [] for stage in FIGURES}
     for stage, own in stage_outputs(stored):
         before = FIGURES[stage](own, true)
@@ -44,7 +42,7 @@ def caught(
             bad = made_worse(stage, own, true, perturbation, name, int(rng.integers(1 << 31)))
             if bad is not None:
                 whole = replace(bad, images=stored.images | bad.images)
-                out[stage].append(bool(worse(compare(stored, whole, true), slack, ALPHA, others)))
+                out[stage].append(bool(grown(compare(stored, whole, true), slack)))
     return out
 
 
@@ -90,8 +88,7 @@ def run(quick: bool = False) -> dict[str, Any]:
     for seed, name in enumerate(objects):
         frozen = Frozen.load(name)
         stored, slack = load_scores(frozen.scores_file)
-        others = (len(SCENES) - 1) * len(slack)
-        for stage, own in caught(stored, slack, frozen.true, 2 if quick else REPETITIONS, others).items():
+        for stage, own in caught(stored, slack, frozen.true, 2 if quick else REPETITIONS).items():
             power[stage] += own
         chances += by_chance(stored, frozen.true, 4 if quick else DRAWS, seed)
     alarms = [d.chance() < LEVEL for d in chances]
