@@ -137,12 +137,13 @@ class ExactLight:
         from disco_twin.light.sources import HatSource
 
         vertices, faces = np.asarray(fine.vertices, np.float64), np.asarray(fine.faces, np.int64)
+        normals = np.asarray(fine.vertex_normals)
         area, lasers = np.asarray(self.basis.T @ self.areas), transport.lasers
         value, variance = np.zeros((2, lasers, len(spots.position), len(area)))
         used = np.flatnonzero(spots.transmitted > 0)
         for low in range(0, len(used), SPOTS_AT_ONCE):
             some = used[low : low + SPOTS_AT_ONCE]
-            hats = np.repeat([_footprint(vertices, spots, spot) for spot in some], REPLICATES, axis=0)
+            hats = np.repeat([_footprint(vertices, normals, spots, spot) for spot in some], REPLICATES, axis=0)
 
             def source(group: Sequence[int], hats: F64 = hats) -> HatSource:
                 return HatSource(vertices, faces, hats, len(group))
@@ -202,15 +203,16 @@ def _solved(mass: sparse.csc_array, moments: F64) -> F64:
     return np.asarray(sparse_linalg.spsolve(mass, moments.T).reshape(mass.shape[0], -1).T)
 
 
-def _footprint(vertices: F64, spots: Spots, spot: int) -> F64:
-    """(V,) 1 inside a beam where it meets the surface, 0 elsewhere."""
+def _footprint(vertices: F64, normals: F64, spots: Spots, spot: int) -> F64:
+    """(V,) 1 inside a beam where it meets the surface, 0 elsewhere: on the other side of a thin wall, too."""
     way = vertices - spots.position[spot]
     along = way @ spots.direction[spot]
     across2 = (way**2).sum(axis=1) - along**2
-    near = np.abs(along) < 4 * spots.beam_radius  # not where it would leave on the other side
-    inside = (across2 < spots.beam_radius**2) & near
+    near = np.abs(along) < 4 * spots.beam_radius  # not what lies behind
+    met = normals @ spots.direction[spot] < 0.0  # nor where it would leave through a wall thinner than that
+    inside = (across2 < spots.beam_radius**2) & near & met
     if not inside.any():  # between the vertices
-        inside[np.argmin((way**2).sum(axis=1))] = True
+        inside[np.argmin(np.where(met, (way**2).sum(axis=1), np.inf))] = True
     return np.asarray(inside, np.float64)
 
 
