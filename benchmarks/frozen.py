@@ -164,7 +164,7 @@ def environment(**values: str) -> Iterator[None]:
 def differences(frozen: Frozen, outputs: StageOutputs) -> tuple[list[Difference], dict[str, float]]:
     """From what is stored to these outputs; and by figure, what may be worse without a reason."""
     stored, slack = load_scores(frozen.scores_file)
-    return compare(stored, outputs, frozen.true), slack
+    return compare(stored, outputs, frozen.true, whole=True), slack
 
 
 def grown(own: Sequence[Difference], slack: Mapping[str, float], alpha: float = ALPHA) -> list[Difference]:
@@ -184,6 +184,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("what", nargs="?", choices=("compare", "make", "store"), default="compare")
     parser.add_argument("--objects", default=",".join(SCENES), help=f"of {', '.join(SCENES)}; left out: all")
     options = parser.parse_args(arguments)
+    if unknown := set(options.objects.split(",")) - set(SCENES):
+        parser.error(f"argument --objects: {', '.join(sorted(unknown))}: choose from {', '.join(SCENES)}")
     console, found = Console(), dict[str, tuple[list[Difference], dict[str, float]]]()
     for name in options.objects.split(","):
         if options.what == "make":

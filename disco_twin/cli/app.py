@@ -245,7 +245,7 @@ def compare(
             remedy=f"{plot.stem}.svg",
         )  # fmt: skip
     differences = compare_runs(first, second, (names[0], names[-1]))
-    shown = (names[0], names[1]) if len(names) == 2 else (first.name, second.name)
+    shown = (names[0], names[1]) if len(names) == 2 else (first.resolve().name, second.resolve().name)
     if shown[0] == shown[1]:
         shown = "first", "second"
     console.print(difference_table(differences, *shown))

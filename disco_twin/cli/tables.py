@@ -49,7 +49,7 @@ def difference_table(differences: Sequence[Difference], first: str, second: str)
     later, sooner = ({d.figure for d in worse(rows)} for rows in (differences, [d.swapped for d in differences]))
     for d in differences:
         verdict = "worse" if d.figure in later else "better" if d.figure in sooner else ""
-        error = "exact" if d.error == 0 else f"{d.error:.2g}"
+        error = "exact" if d.error == 0 else "?" if math.isnan(d.error) else f"{d.error:.2g}"
         table.add_row(d.figure, f"{d.first:.4g}", f"{d.second:.4g}", f"{d.difference:+.2g}", error, verdict)
     return table
 

@@ -29,10 +29,10 @@ from disco_twin.evaluate.stage_figures import (
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.run_folder import RunFolder
 from disco_twin.light.truth import Truth
-from hw.base.arrays import F64, Bool
+from hw.base.arrays import F64
 from hw.base.errors import InputError
 from pipeline.reconstruct.samples.distances import beam_footprints
-from pipeline.relight.scores import BLOCK, paired_difference
+from pipeline.relight.scores import block_sums, paired_difference
 
 ROUNDING = 1e-5  # of a figure: by less nothing is worse
 ALPHA = 1e-3  # chance that any of the figures compared is called worse where none is
@@ -44,7 +44,8 @@ class Difference:
     """One figure of two outputs; figures are errors, larger in size where worse.
 
     figure: its name, the stage before the slash; first, second: its values; difference: by how much the second is
-    larger in size; error: standard error of that; freedom: degrees of freedom that this error is known with
+    larger in size; error: standard error of that, NaN where it is unknown; freedom: degrees of freedom that this error
+    is known with
     """
 
     figure: str
@@ -71,6 +72,8 @@ class Difference:
         excess = self.difference - max(slack, ROUNDING * abs(self.first))
         if self.error == 0 or math.isinf(excess):
             return 0.0 if excess > 0 else 1.0
+        if math.isnan(self.error):
+            return 1.0  # unknown: chance cannot be ruled out
         z = excess / self.error
         return float(special.ndtr(-z) if math.isinf(self.freedom) else special.stdtr(self.freedom, -z))
 
@@ -92,14 +95,19 @@ def worse(
     return [d for d in differences if sidak(d.chance((slack or {}).get(d.figure, 0.0)), count) < alpha]
 
 
-def compare(first: StageOutputs, second: StageOutputs, true: TrueRun) -> list[Difference]:
-    """Every figure that both outputs have, stage by stage."""
+def compare(first: StageOutputs, second: StageOutputs, true: TrueRun, whole: bool = False) -> list[Difference]:
+    """Every figure that both outputs have, stage by stage.
+
+    whole: what the second lacks is no number there, and so worse, instead of being left out
+    """
     before, after = all_figures(first, true), all_figures(second, true)
     errors = _replicate_errors(first, second, true)
     freedom = len(true.truth.replicates) - 1.0
     out = []
     for name in before:
         if name not in after:
+            if whole:
+                out.append(Difference(name, before[name], math.nan, math.nan))
             continue
         plain = Difference(name, before[name], after[name], _growth(before[name], after[name]))
         if name in errors:
@@ -115,7 +123,9 @@ def _growth(before: float, after: float) -> float:
 
 
 def _replicate_errors(first: StageOutputs, second: StageOutputs, true: TrueRun) -> dict[str, float]:
-    """Standard errors by leaving out one of the truth's replicates after the other (Efron and Stein 1981)."""
+    """Standard errors by leaving out one of the truth's replicates after the other (Efron and Stein 1981); NaN where a
+    figure is not there without one of them.
+    """
     replicates, parts = true.truth.replicates, []
     given = [(o, beam_footprints(true.scan, o.spots)) for o in (first, second)]
     for k in range(len(replicates)):
@@ -126,7 +136,7 @@ def _replicate_errors(first: StageOutputs, second: StageOutputs, true: TrueRun) 
     n = len(parts)
     values = {name: np.array([part.get(name, math.nan) for part in parts]) for name in parts[0]}
     return {
-        name: float(np.sqrt((n - 1) / n * ((v - v.mean()) ** 2).sum())) if np.isfinite(v).all() else 0.0
+        name: float(np.sqrt((n - 1) / n * ((v - v.mean()) ** 2).sum())) if np.isfinite(v).all() else math.nan
         for name, v in values.items()
     }
 
@@ -142,19 +152,14 @@ def _of_image(plain: Difference, first: StageOutputs, second: StageOutputs, true
         return plain
     if what == "nrmse":  # of squares; a difference of roots is that over their sum
         squares, error = paired_difference(other, one, a, b, mask)
-        freedom = _freedom(_blocks((np.asarray(other, np.float64) - one) * (np.asarray(a, np.float64) - b), mask))
+        freedom = _freedom(
+            block_sums(((np.asarray(other, np.float64) - one) * (np.asarray(a, np.float64) - b))[:, mask], mask)
+        )
         return replace(plain, difference=squares / size, error=error / size, freedom=freedom)
-    whole, sums = (_blocks(0.5 * (np.asarray(a, np.float64) + sign * b), mask) for sign in (1, -1))
+    whole, sums = (block_sums(0.5 * (np.asarray(a, np.float64) + sign * b)[:, mask], mask) for sign in (1, -1))
     pull = math.copysign(1 + plain.second, plain.second) - math.copysign(1 + plain.first, plain.first)
     error = abs(pull) * float(np.sqrt((sums**2).sum()) / whole.sum())
     return replace(plain, error=error, freedom=_freedom(sums))
-
-
-def _blocks(values: F64, mask: Bool) -> F64:
-    """(L, H, W) -> sums over wavelengths and blocks of the mask's pixels, 1-D."""
-    rows, columns = np.nonzero(mask)
-    block = (rows // BLOCK) * (mask.shape[1] // BLOCK + 1) + columns // BLOCK
-    return np.bincount(block, weights=values[:, mask].sum(axis=0)).astype(np.float64)
 
 
 def _freedom(parts: F64) -> float:

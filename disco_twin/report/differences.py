@@ -21,7 +21,12 @@ def write_differences(path: Path, differences: Sequence[Difference], first: str,
 
     path: its ending says the format, as matplotlib knows them. Raises: OSError where it cannot be written.
     """
-    rows = [d for own in by_stage(differences).values() for d in own if math.isfinite(d.difference) and d.first]
+    rows = [
+        d
+        for own in by_stage(differences).values()
+        for d in own
+        if d.first and math.isfinite(d.first) and not math.isnan(d.difference)
+    ]
     figure, axes = new_figure(WIDTH, 1.0 + ROW * max(len(rows), 1))
     at = np.arange(len(rows))
     per_cent = np.array([100 / abs(d.first) for d in rows])

@@ -48,8 +48,8 @@ def signed_root(square: float) -> float:
     return math.copysign(math.sqrt(abs(square)), square)
 
 
-def _block_sums(values: F64, mask: Bool) -> F64:
-    """(L, N) values on the mask's pixels -> sums over wavelengths and BLOCK x BLOCK pixels, 1-D."""
+def block_sums(values: F64, mask: Bool) -> F64:
+    """(L, N) values on the mask's (H, W) pixels -> sums over wavelengths and BLOCK x BLOCK pixels, 1-D."""
     rows, columns = np.nonzero(mask)
     block = (rows // BLOCK) * (mask.shape[1] // BLOCK + 1) + columns // BLOCK
     return np.bincount(block, weights=values.sum(axis=0)).astype(np.float64)
@@ -79,7 +79,7 @@ def score_relit(image: ArrayLike, half_a: ArrayLike, half_b: ArrayLike, mask: Bo
     if denominator <= 0:
         raise Unscorable("the reference holds no light above its noise")
     nrmse2 = float(((i - a) * (i - b)).sum()) / denominator
-    noise = _block_sums((i - mean + nrmse2 * mean) * 2 * half, mask)
+    noise = block_sums((i - mean + nrmse2 * mean) * 2 * half, mask)
     nrmse2_se = float(np.sqrt((noise**2).sum())) / denominator
     root_se = 0.5 * (signed_root(nrmse2 + nrmse2_se) - signed_root(nrmse2 - nrmse2_se))  # defined at 0, too
     exposure = float(np.percentile(mean, 99.0))
@@ -118,7 +118,7 @@ def paired_difference(
     if i.size == 0 or denominator <= 0:
         raise Unscorable("the mask holds no pixel, or the reference no light above its noise")
     difference = float(((i - j) * (i + j - a - b)).sum()) / denominator
-    noise = _block_sums((i - j + difference * (a + b) / 2) * (a - b), mask)
+    noise = block_sums((i - j + difference * (a + b) / 2) * (a - b), mask)
     return difference, float(np.sqrt((noise**2).sum())) / denominator
 
 
@@ -149,6 +149,6 @@ def score_halves(images: ArrayLike, halves: ArrayLike, mask: Bool) -> HalvesScor
         raise Unscorable("the reference holds no light above its noise")
     error, mean, d, e = (i + j - a - b) / 2, (a + b) / 2, (i - j) / 2, (a - b) / 2
     nrmse2 = float((error**2 - d**2 - e**2).sum()) / denominator
-    noise = _block_sums(2 * (error * (e - d) + nrmse2 * mean * e), mask)
+    noise = block_sums(2 * (error * (e - d) + nrmse2 * mean * e), mask)
     se2 = float(np.sqrt((noise**2).sum())) / denominator
     return HalvesScore(signed_root(nrmse2), 0.5 * (signed_root(nrmse2 + se2) - signed_root(nrmse2 - se2)))

@@ -12,6 +12,7 @@ which images do not part: R_d has it, and the ratio is 1 on average where sample
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -27,6 +28,8 @@ from pipeline.geometry.microfacet import rough_transmittance
 from pipeline.geometry.pixel_footprints import trace_pixels
 from pipeline.reconstruct.samples.samples import Samples, SpotSumImage
 
+log = logging.getLogger(__name__)
+
 EDGES = np.array([0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0 + 1e-9])
 SUPERSAMPLE = 3
 MATCHED = 1e-3  # difference of the indices below which all light passes
@@ -36,7 +39,6 @@ LINE_SPREAD = 0.1  # of the line's slope: what an index of 1.3 to 1.7, and light
 NORMAL_ERROR = 0.03  # rad, that the scan's normals have in common at one view cosine
 BIN_ERROR = 0.02  # relative, of a bin: what the model leaves of the sums
 OUTLIER = Huber(2.0)
-WORST = 1e12  # cost of a fit that did not converge
 CURVE = np.concatenate([[0.0], np.geomspace(0.002, 0.05, 8), np.linspace(0.1, 1.0, 19)])  # cosines of its corners
 
 
@@ -114,12 +116,18 @@ def rough_boundary(eta: float, cosines: F64, ratio: F64) -> Boundary:
         rough = np.log(rough_transmittance(c, eta, float(np.exp(log_alpha))) / transmittance(c, eta))
         found = minimise(lambda x: (line @ x + rough - measured) / sigma, np.zeros(2), prior, loss=OUTLIER)
         if not found.ended.converged:  # such an alpha is not the likeliest
-            return found.value, WORST
+            return found.value, np.inf
         cost = OUTLIER.cost(found.residual).sum() + (found.value[1] / LINE_SPREAD) ** 2
         return found.value, float(cost + ((log_alpha - USUAL) / USUAL_SPREAD) ** 2)
 
     tried = np.array([fitted(log_alpha)[1] for log_alpha in np.log(ALPHAS)])
-    best, _ = likeliest(np.log(ALPHAS), tried)
+    if not (finite := np.isfinite(tried)).any():
+        log.warning("no roughness explains what the images show of the boundary: taken as smooth")
+        return Boundary(eta)
+    lowest = int(np.argmin(tried))
+    best = float(np.log(ALPHAS[lowest]))
+    if finite[max(lowest - 1, 0) : lowest + 2].all():  # else there is no parabola through its neighbours
+        best, _ = likeliest(np.log(ALPHAS), np.where(finite, tried, tried[finite].max()))
     at, (level, tilt) = np.maximum(CURVE, 1e-3), fitted(best)[0]
     curve = rough_transmittance(at, eta, float(np.exp(best))) / transmittance(at, eta) * np.exp(level + tilt * (1 - at))
     return Boundary(eta, tuple(map(float, CURVE)), tuple(map(float, curve)))

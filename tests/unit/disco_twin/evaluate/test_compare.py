@@ -53,6 +53,20 @@ def test_a_stage_that_got_worse_is_named_and_one_that_got_better_is_not() -> Non
     assert not worse([grown.swapped])
 
 
+def test_what_is_gone_is_worse_where_all_is_asked_for() -> None:
+    outputs, true = small()
+    without = replace(outputs, exitance=None)
+    gone = {d.figure for d in compare(outputs, outputs, true)} - {d.figure for d in compare(outputs, without, true)}
+    assert any(name.startswith("completion/") for name in gone)
+    assert gone <= {d.figure for d in worse(compare(outputs, without, true, whole=True))}
+
+
+def test_an_unknown_error_makes_nothing_worse_by_chance() -> None:
+    assert not worse([Difference("completion/x", 0.1, 0.2, 0.1, np.nan)])
+    assert worse([Difference("completion/x", 0.1, 0.2, 0.1, 0.0)])
+    assert worse([Difference("completion/x", 0.1, np.inf, np.inf, np.nan)])
+
+
 @pytest.fixture(scope="module")
 def judged_anew() -> list[dict[str, Difference]]:
     """Two outputs that err differently, judged many times by truth and references of other noise."""

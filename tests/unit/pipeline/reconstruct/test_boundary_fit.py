@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
+from hw.base.outcome import Ended, Outcome
+from pipeline.calibrate import least_squares
+from pipeline.calibrate.least_squares import Linearised
 from pipeline.geometry.fresnel import transmittance
 from pipeline.geometry.microfacet import rough_transmittance
+from pipeline.reconstruct.global_term import boundary_fit
 from pipeline.reconstruct.global_term.boundary_fit import EDGES, rough_boundary
 
 MIDDLE = 0.5 * (EDGES[1:] + EDGES[:-1])[2:]
@@ -62,3 +71,24 @@ def test_levels_pass_through() -> None:
 def test_a_matched_boundary_and_too_few_bins_stay_smooth() -> None:
     assert rough_boundary(1.0, MIDDLE, np.ones(len(MIDDLE))).ratio == (1.0,)
     assert rough_boundary(1.3, MIDDLE[:2], np.ones(2)).ratio == (1.0,)
+
+
+@pytest.mark.parametrize("lost", [lambda k: k % 2 == 1, lambda k: True])
+def test_roughnesses_that_no_fit_was_found_for_do_not_count(
+    lost: Callable[[int], bool], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Rationale: every second fit stopped, beside the likeliest roughness; and all of them."""
+    calls, stopped = itertools.count(), Ended(Outcome.STOPPED, 9)
+
+    def minimise(*given: Any, **settings: Any) -> Linearised:
+        found = least_squares.minimise(*given, **settings)
+        k = next(calls)
+        return replace(found, ended=stopped) if k < len(boundary_fit.ALPHAS) and lost(k) else found
+
+    monkeypatch.setattr(boundary_fit, "minimise", minimise)
+    found = rough_boundary(1.3, MIDDLE, seen(0.3, 1.3))
+    if lost(0):
+        assert set(found.ratio) == {1.0}
+        assert "taken as smooth" in caplog.text
+    else:
+        np.testing.assert_allclose(np.interp(MIDDLE, found.cosines, found.ratio)[2:], seen(0.3, 1.3)[2:], rtol=0.05)
