@@ -7,6 +7,7 @@ import ipaddress
 import os
 import select
 import socket
+import struct
 import termios
 import time
 from collections.abc import Generator
@@ -16,8 +17,9 @@ import serial
 
 FAILURES = (OSError, termios.error, ValueError)  # of a port; pyserial lets the second through
 CONNECT_S = 2.0
+NO_LINGER = struct.pack("ii", 1, 0)  # closing frees the number at once
 RETURN_S = 600.0  # how long a cable that was pulled may be away
-SERVED_S = 10.0  # how long a port that another program serves may: that program has ended, or is started anew
+SERVED_S = 10.0  # how long a linked pseudo-terminal may: the program behind it has ended, or is started anew
 
 Port = serial.SerialBase | socket.socket
 
@@ -51,6 +53,9 @@ def _connected(url: str) -> Generator[None, object, socket.socket]:
                 yield
         if failed:
             raise OSError(failed, os.strerror(failed))
+        if port.getsockname() == port.getpeername():  # nobody listens, and the kernel chose that very number for us
+            port.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, NO_LINGER)  # else its server could not have it again
+            raise OSError(errno.ECONNREFUSED, os.strerror(errno.ECONNREFUSED))
     except BaseException:
         port.close()
         raise
@@ -60,10 +65,9 @@ def _connected(url: str) -> Generator[None, object, socket.socket]:
 def return_s(url: str) -> float:
     """How long an open port may come back once it has vanished, under the same name.
 
-    The number of a pseudo-terminal is given to the next one, whoever opens it: by that it never comes back.
+    The number of a pseudo-terminal is given to the next one, whoever opens it: by that it never comes back. A network
+    port is a cable, on this machine too: behind 127.0.0.1 there may be a real laser's serial server, or an ssh tunnel.
     """
-    if url.startswith("socket://"):
-        return SERVED_S if ipaddress.ip_address(urlsplit(url).hostname or "").is_loopback else RETURN_S
-    if not os.path.realpath(url).startswith(("/dev/pts/", "/dev/ttys")):
+    if url.startswith("socket://") or not os.path.realpath(url).startswith(("/dev/pts/", "/dev/ttys")):
         return RETURN_S
     return SERVED_S if os.path.islink(url) else 0.0

@@ -39,7 +39,7 @@ class SupervisedDevice:
         self.dark = False
         self._port: Port | None = None
         self._return_s, self._answer_s = RETURN_S, ANSWER_S
-        with suppress(ValueError):  # of an address, which opening reports
+        with suppress(ValueError):  # of a name that is no path, which opening reports
             self._return_s = return_s(self.url)
         self._to_device = self._to_host = self._said = b""
         self._doing = self._insist() if self.lit else self._lend()

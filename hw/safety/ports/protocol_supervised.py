@@ -45,16 +45,20 @@ def port_of(url: str) -> str:
     return url.removeprefix(PREFIX).partition(":")[2] if url.startswith(PREFIX) else url
 
 
-def _in_numbers(port: str) -> str:
-    """The address of a network port: the supervisor cannot wait for one that is a name. Raises: SerialException."""
+def _in_numbers(port: str) -> list[str]:
+    """A network port by each address of its host: the supervisor cannot wait for a name. Other ports as they are.
+
+    Raises: SerialException.
+    """
     if not port.startswith("socket://"):
-        return port
+        return [port]
     parts = urlsplit(port)
     try:
-        address = socket.getaddrinfo(parts.hostname, parts.port, type=socket.SOCK_STREAM)[0][4][0]
+        found = socket.getaddrinfo(parts.hostname, parts.port, type=socket.SOCK_STREAM)
     except OSError as error:
         raise SerialException(f"{parts.hostname}: {error.strerror}") from error
-    return f"socket://[{address}]:{parts.port}" if ":" in str(address) else f"socket://{address}:{parts.port}"
+    addresses = dict.fromkeys(str(entry[4][0]) for entry in found)
+    return [f"socket://[{a}]:{parts.port}" if ":" in a else f"socket://{a}:{parts.port}" for a in addresses]
 
 
 class GoneDark(SerialException):
@@ -191,8 +195,9 @@ class SupervisedPort(SerialBase):
         kind = str(self.port).removeprefix(PREFIX).partition(":")[0]
         if kind not in KINDS:
             raise SerialException(f"{kind!r} is no kind of device that is supervised: {', '.join(KINDS)}")
-        request, end = f"{kind} {self.baudrate} 0 {_in_numbers(port_of(str(self.port)))}", time.monotonic() + IN_USE_S
+        urls, end = _in_numbers(port_of(str(self.port))), time.monotonic() + IN_USE_S
         while True:
+            request = f"{kind} {self.baudrate} 0 {urls[0]}"
             host = LIFELINE.lend(request)
             try:
                 said = host.recv(1)  # what follows READY is the device's
@@ -205,6 +210,9 @@ class SupervisedPort(SerialBase):
                 host.close()
                 raise
             host.close()
+            if urls[1:]:
+                urls = urls[1:]  # `localhost` may be ::1 first, and its server on 127.0.0.1 alone
+                continue
             if b"exclusively" not in said or time.monotonic() > end:
                 raise SerialException(said.decode(errors="replace") or "the supervisor did not start")
             time.sleep(BEAT_S)

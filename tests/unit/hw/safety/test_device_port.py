@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import _socket
 import errno
 import fcntl
 import logging
 import os
 import pty
+import select
 import socket
 import threading
 import time
@@ -16,6 +18,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
+import serial
 from capture_fakes import fork
 from supervisor_fakes import LIMIT_S, Laser, Opening, serving, wait
 
@@ -68,11 +71,94 @@ def test_lasers_go_off_while_a_network_port_is_being_opened(
 
 
 def test_names_of_hosts_are_looked_up_by_the_program() -> None:
-    assert _in_numbers("socket://localhost:4001") in ("socket://127.0.0.1:4001", "socket://[::1]:4001")
-    assert _in_numbers("socket://10.0.0.5:4001") == "socket://10.0.0.5:4001"
-    assert _in_numbers("/dev/ttyUSB0") == "/dev/ttyUSB0"
+    assert {*_in_numbers("socket://localhost:4001")} <= {"socket://127.0.0.1:4001", "socket://[::1]:4001"}
+    assert _in_numbers("socket://10.0.0.5:4001") == ["socket://10.0.0.5:4001"]
+    assert _in_numbers("/dev/ttyUSB0") == ["/dev/ttyUSB0"]
     with pytest.raises(ValueError, match="named"):
         next(opened("socket://named:1", 9600))
+
+
+@contextmanager
+def serial_server(laser: Laser, number: int = 0) -> Iterator[int]:
+    """A program that serves a laser's port on 127.0.0.1 alone, as a serial server or an ssh tunnel does."""
+    ended = threading.Event()
+    with socket.create_server(("127.0.0.1", number)) as server:
+        thread = threading.Thread(target=_serve, args=(server, laser.port, ended))
+        thread.start()
+        try:
+            yield server.getsockname()[1]
+        finally:
+            ended.set()
+            thread.join()
+
+
+def _serve(server: socket.socket, port: str, ended: threading.Event) -> None:
+    cable = os.open(port, os.O_RDWR | os.O_NOCTTY)
+    with ExitStack() as left:
+        left.callback(os.close, cable)
+        to: dict[int, int] = {}
+        while not ended.is_set():
+            for file in select.select([server.fileno(), *to], [], [], 0.01)[0]:
+                if file == server.fileno():
+                    user = left.enter_context(server.accept()[0]).fileno()
+                    to = {user: cable, cable: user}
+                elif data := os.read(file, 256):
+                    os.write(to[file], data)
+                else:
+                    to = {}  # the user has hung up
+
+
+def test_every_address_of_a_host_is_tried(laser: Laser, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`localhost` is ::1 first on many machines, and a server may be on 127.0.0.1 alone."""
+    with serial_server(laser) as number:
+        found = [(socket.SOCK_STREAM, 6, "", (address, number)) for address in ("::1", "::1", "127.0.0.1")]
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: [(socket.AF_UNSPEC, *entry) for entry in found])
+        url = f"socket://localhost:{number}"
+        assert _in_numbers(url) == [f"socket://[::1]:{number}", f"socket://127.0.0.1:{number}"]
+        port = SupervisedPort(f"supervised://laser:{url}", baudrate=500000, timeout=0.5, write_timeout=1)
+        assert LIFELINE.lent[port].endswith(f" socket://127.0.0.1:{number}")  # what is repeated to the next supervisor
+        port.write(b"?LOn\r")
+        wait(laser, on=True)
+        port.close()
+        assert not laser.on
+    with pytest.raises(serial.SerialException, match=os.strerror(errno.ECONNREFUSED)):
+        port.open()
+
+
+def test_a_connection_to_itself_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nobody listens the kernel may choose the very number as ours: held, no server could take it again."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        number = server.getsockname()[1]
+
+    def unlucky(port: socket.socket, address: tuple[str, int]) -> int:
+        port.bind(address)
+        return _socket.socket.connect_ex(port, address)
+
+    monkeypatch.setattr(socket.socket, "connect_ex", unlucky)
+    with pytest.raises(ConnectionRefusedError):
+        deque(opened(f"socket://127.0.0.1:{number}", 500000), 0)
+    socket.create_server(("127.0.0.1", number)).close()
+
+
+def test_a_lit_laser_behind_a_local_server_is_put_out_when_that_returns(
+    lasers: Callable[..., Laser], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is no emulator that has ended: the laser goes on emitting."""
+    monkeypatch.setattr(device_port, "SERVED_S", 0.2)
+    laser = lasers()
+    with ExitStack() as tunnel:
+        number = tunnel.enter_context(serial_server(laser))
+        with serving(f"socket://127.0.0.1:{number}") as (_, host, thread):
+            host.sendall(b"?LOn\r")
+            wait(laser, on=True)
+            tunnel.close()
+            time.sleep(0.8)
+            assert thread.is_alive() and laser.on
+            with serial_server(laser, number):
+                wait(laser, on=False)
+                thread.join(3.0)
+                assert not thread.is_alive()
+    assert "LIGHT MAY BE ON" in caplog.text and "if the port returns within 600 s" in caplog.text
 
 
 def test_a_terminal_that_has_hung_up_is_given_up_at_once(
@@ -111,8 +197,9 @@ def test_how_long_a_port_may_be_away(laser: Laser, tmp_path: Path) -> None:
     link = tmp_path / "laser"
     link.symlink_to(laser.port)
     assert return_s(laser.port) == 0.0
-    assert return_s(str(link)) == return_s("socket://127.0.0.1:7") == SERVED_S
+    assert return_s(str(link)) == SERVED_S
     assert return_s("/dev/ttyUSB0") == return_s("socket://10.0.0.5:7") == RETURN_S == 600.0
+    assert return_s("socket://127.0.0.1:7") == return_s("socket://[::1]:7") == RETURN_S
 
 
 def test_a_laser_whose_answers_come_late_is_believed(laser: Laser, caplog: pytest.LogCaptureFixture) -> None:
