@@ -165,7 +165,7 @@ def test_the_model_relights_the_sphere(result) -> None:  # type: ignore[no-untyp
 def test_a_relit_image_is_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     view, lights = rig().cameras[0].model_dump(), [{"kind": "uniform", "name": "u", "colour": [1, 1, 1]}]
     request = Request.model_validate({"format_version": 1, "relight": {"views": [view], "lights": lights}})
-    same = {name: lambda *_: np.zeros(2) for name in ("lit_by", "seen_by", "image")}
+    same = {name: lambda *_: np.zeros(2) for name in ("prepare", "lit_by", "seen_by", "image")}
     models = {"dipole": SimpleNamespace(mesh=None, boundary=None, image_variance=lambda *_: None, **same)}
     relight(models, request, tmp_path, Stages())  # type: ignore[arg-type]
     (image,) = tmp_path.rglob("*.npy")
