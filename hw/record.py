@@ -15,11 +15,13 @@ from pydantic import Field
 
 from hw.base.arrays import F32, F64, U8, U16, Bool
 
+SINGLE = np.finfo(np.float32)
+
 # Bounds of what files state; they are checked where a file is read.
 NotNegative = Annotated[float, Field(ge=0, le=1e12, allow_inf_nan=False)]
 Exposure = Annotated[float, Field(ge=1e-9, le=1e4, allow_inf_nan=False)]
 Gain = Annotated[float, Field(ge=1e-6, le=1e9, allow_inf_nan=False)]
-Responsivity = Annotated[float, Field(ge=1e-3, le=1e18, allow_inf_nan=False)]  # single precision holds the variances
+Responsivity = Annotated[float, Field(ge=1e-3, le=1e18, allow_inf_nan=False)]  # far beyond either end of sensors
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
@@ -80,7 +82,8 @@ def to_radiance(raw: RawImage, sensor: Sensor, laser: int) -> RadianceImage:
 
     The radiance is unbiased, negative values included: nothing is clipped, and what the exposure decision does to the
     mean is taken out (`_decision_bias`). The variance is estimated from the same charge as the radiance, so weights
-    1/variance of single pixels favour the low ones; average variances over neighbours before weighting with them.
+    1/variance of single pixels favour the low ones; average variances over neighbours before weighting with them. A
+    variance beyond what single precision holds is stated as the nearest that it holds, which is above 0 and finite.
     """
     time = np.ldexp(sensor.longest_exposure_s, -raw.exponent.astype(np.int32))
     scale = 1.0 / (time * sensor.responsivity[laser])
@@ -92,7 +95,7 @@ def to_radiance(raw: RawImage, sensor: Sensor, laser: int) -> RadianceImage:
         signal -= _decision_bias(electrons, raw.exponent, sensor)
     return RadianceImage(
         (signal * scale).astype(np.float32),
-        (noise * scale**2).astype(np.float32),
+        np.clip(noise * scale**2, SINGLE.tiny, SINGLE.max).astype(np.float32),
         raw.charge >= sensor.saturation_dn,
     )
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
+from pydantic import TypeAdapter
 
-from benchmarks.stability.case import Ends, Family, relative
+from benchmarks.stability.case import Family, relative
 from disco_twin.camera.sensor import add_dark, add_read_noise, expected_variance, integrate, quantise
 from hw.base.arrays import F64
-from hw.base.errors import InputError
 from hw.camera.bracket import Bracket
 from hw.record import RawImage, Sensor, to_radiance
+from hw.rig.rig_file import Response
 
 FAMILY = Family("camera")
 WELL, DECISION = 1e5, 7 / 16 * 1e5
@@ -103,24 +104,21 @@ def full_scale() -> float:
     return float((to_radiance(raw, SENSOR, 0).saturated != [[False, True]]).sum())
 
 
-@FAMILY.case(
-    "the most sensitive pixel that is allowed",
-    "variances in single precision stay above 0",
-    "1e24 e-/s per W/(mm^2 sr)",
-    ends=Ends.EITHER,
-)
-def sensitive() -> float:
-    from pydantic import TypeAdapter, ValidationError
+def out_of_single(sensor: Sensor, exponent: int, charge: int) -> float:
+    """1 for a pixel whose radiance is not finite, or whose variance is not above 0 and finite, in single precision."""
+    found = to_radiance(RawImage(np.full((1, 1), exponent, np.uint8), np.full((1, 1), charge, np.uint16)), sensor, 0)
+    return float(not (np.isfinite(found.radiance) & np.isfinite(found.variance) & (found.variance > 0)).all())
 
-    from hw.rig.rig_file import Response
 
-    try:
-        most = TypeAdapter(Response).validate_python(1e24)
-    except ValidationError as error:
-        raise InputError("not in the range", key="sensor.responsivity", value=1e24, allowed="<= 1e18") from error
-    extreme = Sensor(10.0, 12, 12, 24.8, 0.0, 0.0, 64.0, (most,))
-    raw = RawImage(np.zeros((1, 1), np.uint8), np.full((1, 1), 65, np.uint16))
-    return float(to_radiance(raw, extreme, 0).variance[0, 0] <= 0)
+# ---------------------------------------------------------------- a rig file's and a record's outermost sensors
+MOST = TypeAdapter(Response).json_schema()["maximum"]
+for name, extent, sensor, exponent, charge in (
+    ("most", f"{MOST:g} e-/s per W/(mm^2 sr)", Sensor(10.0, 1, 12, 1e-6, 0.0, 0.0, 64.0, (MOST,)), 0, 64),
+    ("least", "1e-3 e-/s per W/(mm^2 sr)", Sensor(1e-9, 24, 16, 1e9, 1e12, 0.0, 0.0, (1e-3,)), 23, 65535),
+):
+    FAMILY.case(f"the {name} sensitive pixel that is allowed", "the variance is above 0 and finite", extent)(
+        partial(out_of_single, sensor, exponent, charge)
+    )
 
 
 @FAMILY.case("predicted variance of radiance that is not light", "finite and positive, of 0 and below 0", "-1 .. 0")

@@ -18,10 +18,11 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from hw.base.errors import DiscoError, InputError
+from hw.base.errors import DiscoError
 from pipeline.reconstruct.medium.tetrahedra import NoMedium
 
 LONGEST_S = 120  # of a case; what takes longer hangs
+LONGEST_LINE = 1500  # characters of a refusal
 Find = Callable[[], float]
 
 
@@ -59,8 +60,9 @@ class Outcome:
 @dataclass(frozen=True)
 class Case:
     """expected: the right answer or the invariant, in words; extent: the range or the condition number that makes it
-    hard; tolerance: the largest error that is right; find: makes the error, or raises; slow: takes more than a moment;
-    rivals: the same question to others, by name
+    hard; tolerance: the largest error that is right; find: makes the error, or raises; says: what a refusal has to
+    contain, so that another reason is not taken for the right one; slow: takes more than a moment; rivals: the same
+    question to others, by name
     """
 
     family: str
@@ -70,6 +72,7 @@ class Case:
     find: Find
     tolerance: float = 0.0
     ends: Ends = Ends.RIGHT
+    says: str = ""
     slow: bool = False
     rivals: Mapping[str, Find] = field(default_factory=dict)
 
@@ -88,14 +91,15 @@ class Case:
             "error": own.error,
             "verdict": str(own.verdict),
             "said": own.said,
-            "as_expected": self.accepts(own.verdict),
+            "as_expected": self.accepts(own),
             "seconds": round(seconds, 3),
             "rivals": {name: {"error": o.error, "verdict": str(o.verdict)} for name, o in others.items()},
         }
 
-    def accepts(self, verdict: Verdict) -> bool:
-        """Whether the case was to end like this."""
-        return str(verdict) in str(self.ends).split(" or ")
+    def accepts(self, own: Outcome) -> bool:
+        """Whether the case was to end like this, a refusal for this reason."""
+        reason = own.verdict is not Verdict.REFUSED or self.says in own.said
+        return reason and str(own.verdict) in str(self.ends).split(" or ")
 
 
 class Family:
@@ -117,14 +121,16 @@ class Family:
 
 
 def outcome(find: Find, tolerance: float) -> Outcome:
-    """What comes of a question. Warnings of NumPy and of this program's own log do not count as refusals."""
+    """What comes of a question. Warnings of NumPy and of this program's own log do not count as refusals; the reason
+    why no medium is fitted does, without a remedy: the reconstruction goes on without one and states the reason.
+    """
     try:
         with warnings.catch_warnings(), limited(LONGEST_S):
             warnings.simplefilter("ignore")
             off = float(find())
     except (DiscoError, NoMedium) as refusal:
         said = re.sub(rf"{re.escape(tempfile.gettempdir())}/\w+/", "", str(refusal))
-        told = "\n" not in said and (not isinstance(refusal, InputError) or bool(refusal.remedy or refusal.allowed))
+        told = "\n" not in said if isinstance(refusal, NoMedium) else said_in_one_line(refusal)
         return Outcome(Verdict.REFUSED if told else Verdict.WRONG, None, said)
     except Hangs:
         return Outcome(Verdict.HUNG, None, f"more than {LONGEST_S} s")
@@ -132,6 +138,12 @@ def outcome(find: Find, tolerance: float) -> Outcome:
         return Outcome(Verdict.CRASHED, None, f"{type(error).__name__}: {' '.join(str(error).split())}"[:200])
     right = math.isfinite(off) and off <= tolerance
     return Outcome(Verdict.RIGHT if right else Verdict.WRONG, off if math.isfinite(off) else None)
+
+
+def said_in_one_line(error: Exception) -> bool:
+    """Whether a refusal is one line, short enough to be read, that names a remedy."""
+    said = str(error)
+    return "\n" not in said and len(said) < LONGEST_LINE and "Remedy: " in said
 
 
 @contextmanager

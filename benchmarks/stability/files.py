@@ -12,9 +12,9 @@ import trimesh
 
 from benchmarks.stability.case import Ends, Family, relative
 from hw.base.arrays import F64
-from hw.base.errors import InputError
 from hw.record import RawImage
 from pipeline.geometry.fresnel import Boundary
+from pipeline.model.lambertian import LambertianTerm
 from pipeline.model.reflectance import GlobalTerm
 from pipeline.model.relightable import RelightableModel
 from pipeline.stream.codec import decode, encode
@@ -58,38 +58,12 @@ for decades, top in ((12.0, 1.0), (12.0, 1e-6)):
     )(partial(saved_off, decades, top))
 
 
-def refused_model(change: Any) -> float:
-    """A model whose entries were changed, saved and loaded."""
-    entries = symmetric(3.0).astype(np.float32)
-    try:
-        made = model(change(entries.copy()))
-    except ValueError as error:
-        raise InputError(str(error), key="reflectance", remedy="reconstruct again") from error
-    return float(np.isfinite(made.reflectance_columns([0]).mean).all())  # type: ignore[union-attr]
-
-
-def put(value: float) -> Any:
-    def change(entries: Any) -> Any:
-        entries[0, 3, 4] = value
-        return entries
-
-    return change
-
-
-for value in (np.nan, np.inf, 7.0):
-    FAMILY.case(
-        f"a model with an entry of {value:g}",
-        "refused: not finite, or not symmetric",
-        "1 of 1764 entries",
-        ends=Ends.REFUSED,
-    )(partial(refused_model, put(value)))
-
-
-def model_file(change: Any) -> float:
-    """A saved model whose file's arrays were changed."""
+def model_file(change: Any, made: RelightableModel | None = None) -> float:
+    """A saved model whose file's arrays were changed. made: with entries and variances, where it is not stated."""
+    exact = symmetric(3.0)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "model.npz"
-        model(symmetric(3.0)).save(path)
+        (made or model(exact, (0.01 * exact**2).astype(np.float32))).save(path)
         with np.load(path) as data:
             arrays = {name: data[name] for name in data.files}
         change(arrays)
@@ -99,22 +73,52 @@ def model_file(change: Any) -> float:
 
 
 def set_item(name: str, value: Any) -> Any:
-    return lambda arrays: arrays.__setitem__(name, value)
+    return lambda arrays: arrays.update({name: value})
 
 
-for name, change in (
-    ("a variance below 0", set_item("term0.variance", -np.ones((1, COUNT, COUNT), np.float32))),
-    ("entries in double precision's range", set_item("term0.reflectance", np.full((1, COUNT, COUNT), np.inf))),
-    ("vertices that are not finite", set_item("vertices", np.full((COUNT, 3), np.nan))),
-    ("vertices all in one place", set_item("vertices", np.zeros((COUNT, 3)))),
-    ("faces that name no vertex", set_item("faces", np.full((80, 3), 99))),
-    ("no faces", set_item("faces", np.zeros((0, 3), np.int64))),
-    ("faces of two corners", set_item("faces", np.zeros((80, 2), np.int64))),
-    ("text for entries", set_item("term0.reflectance", np.array("x"))),
+def set_entry(name: str, value: float) -> Any:
+    return lambda arrays: arrays[name].__setitem__((0, 3, 4), value)
+
+
+NOT_FINITE, NOT_SYMMETRIC = "global.reflectance: holds values that are not finite", "reflectance: is not symmetric"
+VERTICES, FACES = "vertices are not (V, 3) finite numbers", "faces are not (F, 3) whole numbers"
+for name, change, says in (
+    ("an entry of nan", set_entry("term0.reflectance", np.nan), NOT_FINITE),
+    ("an entry of inf", set_entry("term0.reflectance", np.inf), NOT_FINITE),
+    ("an entry of 7", set_entry("term0.reflectance", 7.0), NOT_SYMMETRIC),
+    (
+        "a variance of nan",
+        set_entry("term0.variance", np.nan),
+        "variance: holds values that are not finite",
+    ),
+    (
+        "a variance below 0",
+        set_item("term0.variance", -np.ones((1, COUNT, COUNT), np.float32)),
+        "global.variance: holds values below 0",
+    ),
+    ("vertices that are not finite", set_item("vertices", np.full((COUNT, 3), np.nan)), VERTICES),
+    ("vertices all in one place", set_item("vertices", np.zeros((COUNT, 3))), "a vertex has no area around it"),
+    ("faces that name no vertex", set_item("faces", np.full((80, 3), 99)), "faces and vertices do not fit"),
+    ("no faces", set_item("faces", np.zeros((0, 3), np.int64)), FACES),
+    ("faces of two corners", set_item("faces", np.zeros((80, 2), np.int64)), FACES),
+    ("text for entries", set_item("term0.reflectance", np.full((1, COUNT, COUNT), "x")), "reflectance: holds <U1"),
+    ("one number for entries", set_item("term0.reflectance", np.array(1.0)), "reflectance: has no axis of lasers"),
 ):
-    FAMILY.case(f"a model's file with {name}", "refused in one line", "damage", ends=Ends.REFUSED)(
+    FAMILY.case(f"a model's file with {name}", f"refused: {says}", "damage", ends=Ends.REFUSED, says=says)(
         partial(model_file, change)
     )
+FAMILY.case(
+    "a model's file with an albedo below 0",
+    "refused: lambertian.albedo: holds values below 0",
+    "1 of 42 values",
+    ends=Ends.REFUSED,
+    says="lambertian.albedo: holds values below 0",
+)(
+    lambda: model_file(
+        lambda arrays: arrays["term0.albedo"].__setitem__((0, 3), -0.5),
+        RelightableModel(MESH, Boundary(1.3), (LambertianTerm(np.ones((1, COUNT), np.float32)),)),
+    )
+)
 
 
 def record_off(kind: str) -> float:

@@ -12,10 +12,11 @@ import trimesh
 
 from benchmarks.stability.case import Ends, Family, relative
 from benchmarks.stability.material import scene_with
-from disco_twin.experiment.experiment import rounding_warning
+from disco_twin.experiment.experiment import Experiment, rounding_warning
 from disco_twin.light.majorants import greatest_in_cells, local_majorants
 from disco_twin.object import shapes
 from disco_twin.object.build import Medium, TwinBoundary, TwinObject, build_object, require_places
+from disco_twin.run.scan import require_scattering
 from hw.base.arrays import F64
 
 FAMILY = Family("media")
@@ -79,9 +80,20 @@ for value, ends in ((0.99, Ends.RIGHT), (-0.99, Ends.RIGHT), (1 - 1e-9, Ends.REF
     )(partial(g_kept, value))
 
 
-@FAMILY.case("an object that scatters nothing", "refused", "sigma_t 0", ends=Ends.EITHER)
-def clear() -> float:
-    return float(built({f"{BASE}.sigma_t_per_mm": 0.0}).medium.sigma_t.max())
+def unscattered(sigma_t: float, albedo: float) -> float:
+    """An object that nothing is seen of."""
+    require_scattering(Experiment(scene_with({f"{BASE}.sigma_t_per_mm": sigma_t, f"{BASE}.albedo": albedo})))
+    return 1.0
+
+
+for sigma_t, albedo in ((0.0, 0.9), (1.0, 0.0)):
+    FAMILY.case(
+        f"an object that scatters nothing, albedo {albedo:g}",
+        "refused before the capture",
+        f"sigma_t {sigma_t:g} / mm",
+        ends=Ends.REFUSED,
+        says="object.medium: nothing scatters light",
+    )(partial(unscattered, sigma_t, albedo))
 
 
 def told(size: float, sigma_t: float, most: float) -> float:

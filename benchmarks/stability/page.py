@@ -12,8 +12,9 @@ INTRODUCTION = """# Stability: every numerical kernel at the end of its range
 Made by `make stability`. Each case has its right answer written down before it runs (`benchmarks/stability/`, a module
 for each family): an error below a tolerance, or a refusal in one line. Errors are in the units of the tolerance beside
 them: relative, counts of wrong values, or standard errors. Verdicts: *right*; *refused* in one line with its remedy;
-*silently wrong*, which none may be; *crashed* and *hung*, likewise. Rivals answer the same question: the textbook's
-formula, sums in single precision, the baselines, stock Mitsuba.
+*silently wrong*, which none may be; *crashed* and *hung*, likewise. A medium that is not fitted is refused with its
+reason alone: the reconstruction goes on without one. Rivals answer the same question: the textbook's formula, the
+baselines, stock Mitsuba.
 
 Solvers report an outcome (`hw/base/outcome.py`: converged, stopped after so many steps, singular, out of range) with
 its cause and remedy, and callers act on it: the fits of lenses and of the projector refuse anything but convergence;

@@ -1,4 +1,4 @@
-"""Relighting: single precision against double, twelve decades, light that hardly arrives, many walks added."""
+"""Relighting: single precision against double, twelve decades, light that hardly arrives."""
 
 from __future__ import annotations
 
@@ -142,32 +142,3 @@ def slopes() -> float:
     law = TiltLaw(np.array([0.1, 1.0, 10.0]), np.array([0.3, 0.2, 0.1]))
     found = law(np.array([0.0, 1e-6, 0.1, 10.0, 1e6]))
     return relative(found, [0.3, 0.3, 0.3, 0.1, 0.1])
-
-
-# ---------------------------------------------------------------- sums of a thousand million walks
-def added_singly(walks: int = 10**9, block: int = 1 << 20) -> float:
-    """Relative error of the mean of as many equal contributions, added one by one in single precision."""
-    value, total, done = np.float32(0.7310586), np.float32(0), 0
-    while done < walks:
-        sums = np.cumsum(np.concatenate([[total], np.full(block, value)]).astype(np.float32))
-        done += block
-        if sums[-1] == total:  # the sum stands still: a contribution is below half its last digit
-            break
-        total = sums[-1]
-    return abs(float(total) / walks / float(value) - 1)
-
-
-def added_in_quanta(walks: int = 10**9) -> float:
-    """The same in whole quanta of 2^-24, as images are."""
-    value = np.float32(0.7310586)
-    count = int(float(value) * 2**24)
-    return abs(int(np.uint64(count) * np.uint64(walks)) / 2**24 / walks / float(value) - 1)
-
-
-FAMILY.case(
-    "10^9 walks added in whole quanta",
-    "the mean to 1e-7",
-    "2^24 a walk, 2^54 in all",
-    1e-7,
-    rivals={"sums in single precision": added_singly},
-)(added_in_quanta)

@@ -23,7 +23,7 @@ PROJECTOR_STEPS = STEPS  # of the board's converters
 DARK_COUNTS = 8  # of the photodiode's 1023, with every gate shut
 
 Positive = Annotated[float, Field(gt=0)]
-Response = Annotated[float, Field(ge=1, le=1e18)]  # variances in single precision stay above 0
+Response = Annotated[float, Field(ge=1, le=1e18)]  # within what a record may state (hw.record)
 TtlLine = Annotated[int, Field(ge=0, le=LINES - 1)]
 Step = Annotated[int, Field(ge=0, lt=PROJECTOR_STEPS)]
 PRINTABLE = r"^[^\x00-\x1f\x7f]*$"  # no control characters

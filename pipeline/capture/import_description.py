@@ -23,7 +23,7 @@ class SensorDescription(Strict):
     read_noise_e: Annotated[float, Field(ge=0, le=1e6)]
     dark_e_per_s: Annotated[float, Field(ge=0, le=1e9)]
     offset_dn: Annotated[float, Field(ge=0, le=65535)]
-    responsivity: Annotated[tuple[Annotated[float, Field(ge=1, le=1e24)], ...], Field(min_length=1, max_length=3)]
+    responsivity: Annotated[tuple[Annotated[float, Field(ge=1, le=1e18)], ...], Field(min_length=1, max_length=3)]
     decision_e: Annotated[float, Field(ge=0, le=1e9)] = 0.0
     response: Annotated[tuple[Annotated[float, Field(ge=0, le=1)], ...], Field(max_length=65536)] = ()
 

@@ -70,9 +70,12 @@ class Term(ABC):
 
     @property
     def lasers(self) -> int:
-        """Number of wavelengths."""
+        """Number of wavelengths. Raises: ValueError where the array that tells it has no such axis."""
         name, axes = next((name, a.names) for name, a in self.axes().items() if "laser" in a.names)
-        return int(getattr(self, name).shape[axes.index("laser")])
+        shape, at = getattr(self, name).shape, axes.index("laser")
+        if at >= len(shape):
+            raise ValueError(f"{self.kind}.{name}: has no axis of lasers")
+        return int(shape[at])
 
     @classmethod
     def axes(cls) -> dict[str, Axes]:

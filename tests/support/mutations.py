@@ -78,9 +78,3 @@ def _value(value: Any) -> str:
     if isinstance(value, float):
         return "nan" if math.isnan(value) else f"{'-' if value < 0 else ''}inf" if math.isinf(value) else repr(value)
     return json.dumps(value) if isinstance(value, str) else str(value)
-
-
-def said_in_one_line(error: Exception) -> bool:
-    """Whether a refusal is one line that names a remedy, or at least what is allowed."""
-    said = str(error)
-    return "\n" not in said and len(said) < 1500 and ("Remedy: " in said or "allowed: " in said)

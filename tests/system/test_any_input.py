@@ -19,10 +19,11 @@ import trimesh
 from capture_fakes import SHAPE, frame, small_plan
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mutations import mutated, said_in_one_line, toml
+from mutations import mutated, toml
 from rig_files import CAMERAS, rig_file
 from scene_texts import GOOD
 
+from benchmarks.stability.case import said_in_one_line
 from disco_twin.experiment.experiment import Experiment
 from disco_twin.experiment.keys import identity
 from disco_twin.object import shapes
@@ -318,4 +319,5 @@ def test_streams(changes: list[tuple[str, str, int, bytes]], folder: Path) -> No
 def test_a_refusal_of_several_lines_is_no_refusal() -> None:
     assert not said_in_one_line(InputError("a\nb", remedy="c"))
     assert not said_in_one_line(DiscoError("nothing to be done"))
+    assert not said_in_one_line(InputError("out of range", allowed="0 to 1"))
     assert said_in_one_line(InputError("a", remedy="c"))

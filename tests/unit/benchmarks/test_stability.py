@@ -14,6 +14,7 @@ from benchmarks.stability import case as module
 from benchmarks.stability.case import Case, Ends, Family, Verdict, outcome
 from benchmarks.stability.page import page
 from hw.base.errors import DiscoError, InputError
+from pipeline.reconstruct.medium.tetrahedra import NoMedium
 
 QUICK = stability.cases(slow=False)
 NAMES = [f"{case.family}: {case.name}" for case in QUICK]
@@ -59,7 +60,11 @@ def raising(error: Exception) -> object:
         (lambda: math.nan, Verdict.WRONG),
         (lambda: -math.inf, Verdict.WRONG),
         (raising(DiscoError("no. Remedy: yes")), Verdict.REFUSED),
-        (raising(DiscoError("two\nlines")), Verdict.WRONG),
+        (raising(DiscoError("two\nlines. Remedy: yes")), Verdict.WRONG),
+        (raising(DiscoError("nothing can be done")), Verdict.WRONG),
+        (raising(NoMedium("the samples leave D open")), Verdict.REFUSED),
+        (raising(NoMedium("two\nlines")), Verdict.WRONG),
+        (raising(InputError("no remedy", allowed="1")), Verdict.WRONG),
         (raising(InputError("no remedy", key="a")), Verdict.WRONG),
         (raising(InputError("no", remedy="yes")), Verdict.REFUSED),
         (raising(ValueError("x")), Verdict.CRASHED),
@@ -68,6 +73,12 @@ def raising(error: Exception) -> object:
 )
 def test_verdicts(find: module.Find, verdict: Verdict) -> None:
     assert outcome(find, 1.0).verdict is verdict
+
+
+@pytest.mark.parametrize(("says", "expected"), [("", True), ("below 0", True), ("not symmetric", False)])
+def test_a_refusal_for_another_reason_is_not_as_expected(says: str, expected: bool) -> None:
+    find = raising(InputError("holds values below 0", remedy="yes"))
+    assert Case("a", "b", "c", "d", find, ends=Ends.REFUSED, says=says).row()["as_expected"] is expected
 
 
 def test_what_hangs_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,8 +128,21 @@ BROKEN: list[tuple[str, str, str, object]] = [
     ("diffusion", "points in one plane", "pipeline.reconstruct.medium.tetrahedra.QhullError", KeyError),
     ("meshes", "a scan: a hole", "pipeline.geometry.mesh_file.require_closed", lambda *_: None),
     ("files", "a model's file with vertices all in one place", "pipeline.model.relightable._surface", unchecked),
+    (
+        "files",
+        "a model's file with a variance below 0",
+        "pipeline.model.reflectance.GlobalTerm.check",
+        lambda *_: None,
+    ),
+    (
+        "files",
+        "a model's file with an albedo below 0",
+        "pipeline.model.lambertian.LambertianTerm.check",
+        lambda *_: None,
+    ),
     ("relighting", "parallel light on a ball of 1 mm", "pipeline.relight.irradiance._RULE", np.full((3, 3), 0.4)),
     ("media", "albedo 0.9999999", "disco_twin.scene.object_schema.MOST_ALBEDO", 1.0),
+    ("media", "an object that scatters nothing, albedo 0", "disco_twin.run.scan.LEAST_SCATTERED", 0.0),
 ]
 
 

@@ -49,6 +49,22 @@ def test_one_pixel_by_hand() -> None:
     assert seen.variance[0, 0] == pytest.approx((24400 + 625 + 24.4**2 / 12) / (2.0e12 / 60) ** 2, rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("sensor", "exponent", "charge"),
+    [
+        (Sensor(1 / 30, 12, 12, 1e-6, 0.0, 0.0, 64.0, (1e18,)), 0, 64),
+        (Sensor(1e-9, 24, 16, 1e9, 0.0, 0.0, 0.0, (1e-3,)), 23, 65535),
+    ],
+    ids=["0 in single precision", "inf in single precision"],
+)
+def test_a_variance_beyond_single_precision_stays_above_0_and_finite(
+    sensor: Sensor, exponent: int, charge: int
+) -> None:
+    seen = to_radiance(RawImage(np.array([[exponent]], np.uint8), np.array([[charge]], np.uint16)), sensor, 0)
+    assert 0 < seen.variance[0, 0] < np.inf
+    assert 0 < np.float32(1) / seen.variance[0, 0] < np.inf
+
+
 def test_saturated_means_full_charge() -> None:
     exponent = np.array([[11, 11, 10]], np.uint8)
     charge = np.array([[4095, 4094, 4095]], np.uint16)
